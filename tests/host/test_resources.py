@@ -11,8 +11,7 @@ from refusals import refused
 from small_training import FLAGS
 
 import gasil_jax
-from gasil_jax import run
-from gasil_jax.config import count
+from gasil_jax import config, run
 from gasil_jax.errors import InputError
 from gasil_jax.host import environments, resources
 from gasil_jax.host.members import make_members
@@ -91,7 +90,7 @@ def test_what_needs_most_memory_is_named(agent, changes, part, monkeypatch):
 
 
 class Wide(gasil_jax.Agent):
-    rows: int = count(1)
+    rows: int = config.count(1)
 
     def update_and_reward(self, state, context, key):
         rows = jax.random.normal(key, (self.rows, 1000))
