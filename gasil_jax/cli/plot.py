@@ -13,7 +13,7 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import output_file, plotting, results, saved, tables
+from gasil_jax.host import folders, output_file, plotting, results, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -265,8 +265,8 @@ def _draw_row(row: Any, runs: Sequence[Curves], *, x: str, smooth: int) -> None:
 
 def _is_csv(path: pathlib.Path) -> bool:
     """Return whether a path is another library's CSV file, or a folder of them."""
-    is_run = (path / "config.json").exists()
-    return path.suffix == ".csv" or (not is_run and bool([*path.glob("*.csv")]))
+    has_tables = not folders.has_config(path) and any(path.glob("*.csv"))
+    return path.suffix == ".csv" or has_tables
 
 
 @reports_errors

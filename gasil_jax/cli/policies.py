@@ -6,13 +6,7 @@ from typing import Literal
 
 from gasil_jax.cli.parsing import POSITIONAL, input_checked
 from gasil_jax.errors import InputError
-from gasil_jax.host.saved import (
-    Policies,
-    best_seed,
-    choose_point,
-    find,
-    load_policies,
-)
+from gasil_jax.host.saved import Policies, best_of, load_policies
 from gasil_jax.numpy_policy import ZOO_PREFIX
 
 
@@ -47,6 +41,5 @@ class PolicyOptions:
             # A policy of the zoo has one seed, which needs no name.
             of_zoo = str(self.run).startswith(ZOO_PREFIX)
             if only_best and seed is None and not of_zoo:
-                point = choose_point(self.run, point)
-                seed = best_seed(find(self.run, point)[2])
+                point, seed = best_of(self.run, point)
             return load_policies(self.run, self.checkpoint, point, seed=seed)

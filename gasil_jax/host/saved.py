@@ -61,7 +61,7 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     return stored["env"], str(agent), every
 
 
-def best_seed(every: Sequence[Program]) -> int | None:
+def _best_seed(every: Sequence[Program]) -> int | None:
     """Return the seed with the highest final return of programs; None if unknown."""
     scores = {}
     for each in every:
@@ -75,9 +75,10 @@ def best_seed(every: Sequence[Program]) -> int | None:
     return max(scores, key=scores.__getitem__) if scores else None
 
 
-def choose_point(folder: pathlib.Path, point: int | None) -> int:
-    """Return the number of the requested point of a folder; by default the best."""
-    return _choose_point(folder, sweep.described(folder)["points"], point)
+def best_of(folder: pathlib.Path, point: int | None) -> tuple[int, int | None]:
+    """Return a point, by default the best, and its seed with the highest return."""
+    point = _choose_point(folder, sweep.described(folder)["points"], point)
+    return point, _best_seed(find(folder, point)[2])
 
 
 def _choose_point(
@@ -336,8 +337,7 @@ def load_policy(
     if has_file and which == "last" and point is None:
         return policy.make(numpy_policy.read(path, seed))
     if seed is None:
-        point = choose_point(folder, point)
-        seed = best_seed(find(folder, point)[2])
+        point, seed = best_of(folder, point)
     env, _, _, states = load(
         folder, which, point, seed=seed, env=env, algorithm=algorithm
     )

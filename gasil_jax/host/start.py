@@ -20,8 +20,8 @@ from gasil_jax.host.sweep import Start
 def find(folder: pathlib.Path) -> Start:
     """Return the policy of a run's best seed, in its newest checkpoint."""
     stored = sweep.read(folder)
-    every = saved.programs_of(folder, stored, saved.choose_point(folder, None))
-    seed = saved.best_seed(every)
+    point, seed = saved.best_of(folder, None)
+    every = saved.programs_of(folder, stored, point)
     if seed is None:
         seed = every[0].seeds[0]
     (path,) = (x.path for x in every if seed in x.seeds)

@@ -199,7 +199,7 @@ class Strength(NamedTuple):
 
 #: (nq, B) positions -> (n, B) how far n rows are from being held, and their Jacobians
 #: (n, V, B). Rows that only push act where that is negative.
-Place = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+Residual = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
 
 
 class Layout(NamedTuple):
@@ -208,7 +208,7 @@ class Layout(NamedTuple):
     limits: Limits
     groups: tuple[Group, ...]
     friction: Strength | None
-    others: tuple[tuple[Strength, Place], ...]
+    others: tuple[tuple[Strength, Residual], ...]
 
     @property
     def stiffness(self) -> float:
@@ -420,7 +420,7 @@ def _wide(x: np.ndarray, qpos: jax.Array) -> jax.Array:
     return jnp.broadcast_to(x, (*x.shape[:-1], qpos.shape[-1]))
 
 
-def _equalities(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+def _equalities(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     """Joints and tendons whose positions are polynomials of others'."""
     index = np.flatnonzero(model.eq_active0)
     if not index.size:
@@ -442,7 +442,7 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
         for i in (model.eq_obj1id[index], model.eq_obj2id[index])
     )
 
-    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         own, x = (
             constant_times(of_qpos[i], qpos) - start[i, None].astype(np.float32)
             for i in (first, second)
@@ -456,24 +456,26 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
 
     solver = model.eq_solref[index], model.eq_solimp[index]
     unbounded = np.full(index.size, np.inf)
-    return Strength.of(model, weight[first] + weight[second], solver, unbounded), place
+    return Strength.of(
+        model, weight[first] + weight[second], solver, unbounded
+    ), residual
 
 
-def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     index = np.flatnonzero(model.tendon_frictionloss)
     if not index.size:
         return None
     of_qvel = tendons.fixed(model).of_qvel[index]
 
-    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         return _wide(np.zeros(index.size), qpos), _wide(of_qvel, qpos)
 
     solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
     weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
-    return Strength.of(model, weight, solver, loss), place
+    return Strength.of(model, weight, solver, loss), residual
 
 
-def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     index = np.flatnonzero(model.tendon_limited)
     if not index.size:
         return None
@@ -481,23 +483,23 @@ def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
     low, high = model.tendon_range[index].T[..., None].astype(np.float32)
     margin = model.tendon_margin[index, None].astype(np.float32)
 
-    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         length = constant_times(of_qpos, qpos)
         sign = jnp.where(length - low < high - length, 1.0, -1.0)
         distance = jnp.minimum(length - low, high - length) - margin
         return distance, sign[:, None] * _wide(of_qvel, qpos)
 
     solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
-    return Strength.of(model, model.tendon_invweight0[index], solver), place
+    return Strength.of(model, model.tendon_invweight0[index], solver), residual
 
 
-def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
+def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     index = np.flatnonzero(model.jnt_limited & (model.jnt_type == tree.BALL))
     if not index.size:
         return None
     most = model.jnt_range[index].max(axis=1) - model.jnt_margin[index]
 
-    def place(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
         angles, jacobians = [], []
         for joint in index:
             first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
@@ -509,7 +511,7 @@ def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Place] | None:
 
     solver = model.jnt_solref[index], model.jnt_solimp[index]
     weight = model.dof_invweight0[model.jnt_dofadr[index]]
-    return Strength.of(model, weight, solver), place
+    return Strength.of(model, weight, solver), residual
 
 
 def friction_rows(
@@ -529,10 +531,10 @@ def friction_rows(
 
 @jax.named_scope("constraint_rows")
 def other_rows(
-    strength: Strength, place: Place, qpos: jax.Array, *, qvel: jax.Array
+    strength: Strength, residual: Residual, qpos: jax.Array, *, qvel: jax.Array
 ) -> newton.ContactRows:
     """Return rows of joints or tendons as contacts with one axis."""
-    distance, jacobian = place(qpos)
+    distance, jacobian = residual(qpos)
     inverse_weight, solimp, bound = strength
     acts = distance < 0.0 if bound is None else jnp.ones_like(distance, bool)
     jacobian = materialize(jnp.where(acts[:, None], jacobian, 0.0))

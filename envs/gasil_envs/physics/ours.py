@@ -85,13 +85,13 @@ class JaxPhysics:
     @property
     def warnings(self) -> list[str]:
         """Return the parts of the model that float32 resolves too little of."""
-        own, found = self._dynamics, []
+        own, parts = self._dynamics, []
         if own.layout.stiffness > 3e3:
-            found.append(
+            parts.append(
                 f"contacts, which are {own.layout.stiffness:.0e} times as stiff as "
                 "what they move (by friction, impratio or solimp)"
             )
-        return found + tree.rounding(own.model)
+        return parts + tree.rounding(own.model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
