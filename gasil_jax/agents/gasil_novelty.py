@@ -2,21 +2,19 @@
 
 PPO maximizes the environment's reward r, a bonus b from the discriminator in its
 centred form, which pays nothing on average (see `adversarial`), and one for novelty n
-(see `novelty`), each with a weight from 0 to 1 that follows returns:
+(see `novelty`), both with weights that follow the policy's returns:
 
-    r + alpha q (b - its mean) + novelty_coefficient (1 - p) (n - its mean).
+    r + (1 - p) (alpha q b + novelty_coefficient (n - its mean over the batch)).
 
 Let m be the mean return of the policy's whole episodes over the latest batches,
 discounted as the buffer ranks them, M and S mean and standard deviation over five times
-as many, and m_0 the lowest m so far.
-
-Exploration fades with the learning progress (Oudeyer, Kaplan and Hafner 2007), here the
-rise of the returns in units of their spread:
+as many, and m_0 the lowest m so far. Then p is the learning progress (Oudeyer, Kaplan
+and Hafner 2007), the rise of the returns in units of half their spread,
 
     p = clip(2 (m - M) / S, 0, 1).
 
 So where PPO learns by itself, as from dense rewards, it is left alone; where nothing is
-rewarded, or returns have come to a stand, it explores.
+rewarded, or returns have come to a stand, it explores and imitates.
 
 Of the buffer, only episodes with a return above m are imitated, as self-imitation
 learning (Oh et al. 2018) uses steps whose return is above the value. With R the mean
@@ -45,9 +43,6 @@ from gasil_jax.rollout import Rollout
 # What a batch's episodes still weigh in the moments after the next batch: in those of
 # the latest batches, and in those of more.
 _LATEST, _MORE = 0.9, 0.98
-# How fast exploration fades with the rise of returns, which is below 1 even for returns
-# that only rise.
-_FADING = 2.0
 # Returns that differ by less than this share of their size are equal: float32 sums of
 # equal returns differ by less.
 _EQUAL = 1e-3
@@ -98,10 +93,12 @@ def moments(sums: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def progress(returns: Returns) -> jax.Array:
-    """Return the rise of the returns in standard deviations, (m - M) / S, ()."""
+    """Return p, how fast the returns rise, from 0 to 1, ()."""
     mean, deviation = moments(returns.more)
     resolution = _EQUAL * jnp.abs(mean) + 1e-8
-    return (moments(returns.latest)[0] - mean) / (deviation + resolution)
+    rise = moments(returns.latest)[0] - mean
+    # A steady rise of all returns gives a ratio of 0.8.
+    return jnp.clip(2.0 * rise / (deviation + resolution), 0.0, 1.0)
 
 
 def better(buffer: GoodTrajectories, returns: Returns) -> GoodTrajectories:
@@ -114,7 +111,7 @@ def better(buffer: GoodTrajectories, returns: Returns) -> GoodTrajectories:
 
 
 def lack(good: GoodTrajectories, returns: Returns) -> jax.Array:
-    """Return the share of the gain that the policy lacks, from 0 to 1, ().
+    """Return q, the share of the gain that the policy lacks, from 0 to 1, ().
 
     Args:
       good: the buffer's better episodes, from `better`.
@@ -156,10 +153,10 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
         self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Any, jax.Array, Metrics]:
         good = better(state.buffer, state.returns)
-        lacked, risen = lack(good, state.returns), progress(state.returns)
-        exploring = 1.0 - jnp.clip(_FADING * risen, 0.0, 1.0)
+        exploring = 1.0 - progress(state.returns)
+        imitating = exploring * lack(good, state.returns)
         faded = self.replace(
-            alpha=self.alpha * lacked,
+            alpha=self.alpha * imitating,
             novelty_coefficient=self.novelty_coefficient * exploring,
         )
         imitated, reward, metrics = PPOGASIL.update_and_reward(
@@ -167,6 +164,6 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
         )
         context = context.replace(rollout=context.rollout.replace(reward=reward))
         _, reward, own = PPONovelty.update_and_reward(faded, state, context, key)
-        own |= {"imitation_weight": lacked, "novelty_weight": exploring}
+        own |= {"imitation_weight": imitating, "novelty_weight": exploring}
         own |= self.buffer_metrics(state.buffer)
         return imitated.replace(buffer=state.buffer), reward, metrics | own
