@@ -20,10 +20,12 @@ Of the buffer, only episodes with a return above m are imitated, as self-imitati
 learning (Oh et al. 2018) uses steps whose return is above the value. With R the mean
 return over their steps, and R_1 the best return,
 
-    q = clip((R - m) / (R_1 - m_0), 0, 1),
+    q = clip((R - m) / (R_1 - m_0 + 0.01), 0, 1),
 
-the share of all that was gained since the start that the policy still lacks. If no
-episode is better than the policy, as before the first reward, it imitates nothing.
+the share of all that was gained since the start that the policy still lacks; 0 if no
+episode is better. The buffer ranks episodes by their return plus 0.001 times their mean
+novelty, from 0 to 1, as in PPO+BC+NOVELTY. So where all returns are equal, as before
+the first reward, the policy imitates what is new, with a weight q below 0.1.
 """
 
 from typing import Any
@@ -43,6 +45,8 @@ from gasil_jax.rollout import Rollout
 # What a batch's episodes still weigh in the moments after the next batch: in those of
 # the latest batches, and in those of more.
 _LATEST, _MORE = 0.9, 0.98
+# Added to the gain that q is a share of, so that q is below 0.1 for novelty alone.
+_GAIN = 0.01
 # Returns that differ by less than this share of their size are equal: float32 sums of
 # equal returns differ by less.
 _EQUAL = 1e-3
@@ -62,6 +66,7 @@ class ImitatingExplorer(struct.PyTreeNode):
     visits: Visits
     discriminator: Learner
     buffer: GoodTrajectories
+    novelty: jax.Array  # float32 (env,), sum over the running episode
     returns: Returns
 
 
@@ -118,7 +123,7 @@ def lack(good: GoodTrajectories, returns: Returns) -> jax.Array:
       returns: the policy's returns.
     """
     mean, _ = moments(returns.latest)
-    share = (mean_return(good) - mean) / (good.return_[0] - returns.lowest + 1e-8)
+    share = (mean_return(good) - mean) / (good.return_[0] - returns.lowest + _GAIN)
     return jnp.where(good.size > 0, jnp.clip(share, 0.0, 1.0), 0.0)
 
 
@@ -138,15 +143,18 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
             visits=self.init_visits(key, sizes),
             discriminator=self.init_discriminator(discriminator_key, sizes),
             buffer=self.init_buffer(sizes),
+            novelty=jnp.zeros(sizes.num_envs),
             returns=no_returns(),
         )
 
     def remember(self, state: Any, context: Context) -> Any:
-        batch = context.rollout
+        visits = self.count(state.visits, context)
+        novelty, rank = self.rank(state.novelty, visits, context)
         return state.replace(
-            visits=self.count(state.visits, context),
-            buffer=self.insert(state.buffer, context, batch.discounted_return),
-            returns=follow(state.returns, batch),
+            visits=visits,
+            buffer=self.insert(state.buffer, context, rank),
+            novelty=novelty,
+            returns=follow(state.returns, context.rollout),
         )
 
     def update_and_reward(

@@ -102,6 +102,31 @@ class PPONovelty(Agent):
         mixed = jnp.sum(cell * primes, axis=-1)
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
+    def rank(
+        self, total: jax.Array, visits: Visits, context: Context
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return what ranks episodes: of equal returns the more novel one is higher.
+
+        Args:
+          total: float32 (env,), the novelty of the running episodes before the batch.
+          visits: the counters with the batch's visits.
+          context: the iteration's data.
+
+        Returns:
+          The novelty of the running episodes after the batch; and float32 (time, env),
+          the rank of an episode that ends with a step.
+        """
+        batch = context.rollout
+
+        def add(total: jax.Array, step: Any) -> Any:
+            novelty, ended = step
+            total += novelty
+            return jnp.where(ended, 0.0, total), total
+
+        steps = self.novelty(visits, context), batch.ended
+        novelty, total = jax.lax.scan(add, total, steps)
+        return novelty, batch.discounted_return + _TIE * total / batch.episode_length
+
     def remember(self, state: Any, context: Context) -> Any:
         return state.replace(visits=self.count(state.visits, context))
 
@@ -127,15 +152,6 @@ class PPOBCNovelty(PPONovelty, PPOBC):
         )
 
     def remember(self, state: Explorer, context: Context) -> Explorer:
-        batch, visits = context.rollout, self.count(state.visits, context)
-
-        def add(total: jax.Array, step: Any) -> Any:
-            novelty, ended = step
-            total += novelty
-            return jnp.where(ended, 0.0, total), total
-
-        steps = self.novelty(visits, context), batch.ended
-        novelty, total = jax.lax.scan(add, state.novelty, steps)
-        return_ = batch.discounted_return + _TIE * total / batch.episode_length
-        buffer = self.insert(state.buffer, context, return_)
-        return Explorer(visits, buffer, novelty)
+        visits = self.count(state.visits, context)
+        novelty, return_ = self.rank(state.novelty, visits, context)
+        return Explorer(visits, self.insert(state.buffer, context, return_), novelty)

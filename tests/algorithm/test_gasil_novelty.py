@@ -107,7 +107,7 @@ def test_only_what_is_better_counts_and_by_the_share_that_is_lacked():
     buffer = buffer.replace(return_=buffer.return_.at[:6].set(kept), size=jnp.int32(6))
     good = gasil_novelty.better(buffer, returns)
     assert good.size == 4
-    expected = (kept[:4].mean() - latest) / (kept[0] - lowest)
+    expected = (kept[:4].mean() - latest) / (kept[0] - lowest + 0.01)
     assert 0.1 < expected < 0.9
     np.testing.assert_allclose(gasil_novelty.lack(good, returns), expected, rtol=1e-4)
 
@@ -150,6 +150,8 @@ def test_it_learns_a_maze_that_pays_nothing_at_first():
         np.array(metrics[x]) for x in ("episode_return", "imitation_weight")
     )
     assert np.all(returns[:, 4:12] < 0.1) and np.all(returns[:, -3:].mean(1) > 0.85)
-    # It imitates once something has paid, and less as it pays more often.
-    assert np.all(imitation[np.cumsum(np.nan_to_num(returns), axis=1) == 0.0] == 0.0)
-    assert np.all(imitation.max(1) > 0.7) and np.all(imitation[:, -1] < 0.5)
+    # It imitates once something has paid, and less as it pays more often. Before, it
+    # imitates what is new, a little.
+    assert np.all(imitation[np.cumsum(np.nan_to_num(returns), axis=1) == 0.0] < 0.1)
+    assert np.all(imitation[:, 5] > 0.0)
+    assert np.all(imitation.max(1) > 0.5) and np.all(imitation[:, -1] < 0.5)
