@@ -154,7 +154,7 @@ def choice(default: str, allowed: Iterable[str]) -> Any:
     names = tuple(allowed)
 
     def check(name: str, value: Any) -> None:
-        if value not in names:
+        if not isinstance(value, str) or value not in names:
             raise ValueError(unknown(name, value, names))
 
     return _field(default, check)

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import importlib
 import pathlib
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -33,7 +34,7 @@ from gasil_jax.rewards import REWARD_MODELS
 
 #: The options that `--help` shows; `--help-all` shows all.
 COMMON = frozenset(
-    "env agent preset seeds out resume evaluate_every log grid random "
+    "env agent preset seeds out resume evaluate_every video_every log grid random "
     "reward_delay obs_noise action_noise physics total_steps num_envs batch_steps "
     "minibatch_size num_epochs hidden_sizes learning_rate gamma gae_lambda "
     "entropy_coefficient initial_std decompose_rewards alpha discriminator_updates "
@@ -69,8 +70,8 @@ class Options:
         its number.
       out: folder, created if it is missing; default runs/ENV-AGENT-TIME.
       resume: train what is missing in the folder `out`, with its settings. total_steps
-        and seeds may grow; checkpoint_every, keep_checkpoints, devices and log may
-        differ. If the folder holds nothing yet, training begins.
+        and seeds may grow; checkpoint_every, keep_checkpoints, video_every, devices and
+        log may differ. If the folder holds nothing yet, training begins.
       config: the config.json of another run: what it holds is used for all options that
         are not given.
       init_from: folder of a run, whose best seed's policy, values and normalizer of
@@ -379,6 +380,9 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
 
 def _check(options: Options, requested: Sweep) -> None:
     """Raise `InputError` if a value is not allowed. Nothing is built or compiled."""
+    if requested.recording.video_every is not None:
+        # What follows imports MuJoCo; this says before with what it is to draw.
+        importlib.import_module("gasil_jax.host.video")
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
@@ -386,8 +390,8 @@ def _check(options: Options, requested: Sweep) -> None:
             algorithms.check(each)
         trackers.check(requested.recording.log)
     check_minimum(options, devices=1)
-    counts = ("checkpoint_every", "keep_checkpoints", "evaluate_every")
-    check_minimum(requested.recording, **dict.fromkeys(counts, 1), evaluate_episodes=1)
+    counts = (x for x in names(Recording) if x != "log")
+    check_minimum(requested.recording, **dict.fromkeys(counts, 1))
     check_minimum(requested.settings, max_episode_steps=1)
     if options.out is not None:
         if not options.resume and getattr(options, "shard", None) is None:

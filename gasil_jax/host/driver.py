@@ -23,6 +23,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint
 from gasil_jax.host.evaluations import Evaluation
 from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.intervals import Interval
 from gasil_jax.host.members import Members
 from gasil_jax.host.output_file import note
 from gasil_jax.host.programs import Training
@@ -168,26 +169,20 @@ class _Checkpoints:
 
     def __init__(self, members: Members, root: pathlib.Path, recording: Recording):
         self._members, self._root = members, root
-        self._keep, self._interval = recording.keep_checkpoints, math.inf
-        if recording.checkpoint_every is not None:
-            steps = members.config.batch_steps
-            self._interval = math.ceil(recording.checkpoint_every / steps)
+        self._keep = recording.keep_checkpoints
+        self.interval = Interval(recording.checkpoint_every, members.config)
         self._saved_at = time.monotonic()
         self._best_score = checkpoint.best_score(root)
         if self._keep:
             checkpoint.check_writable(root)
 
-    def iterations_left(self, done: int) -> float:
-        """Return the iterations to the next checkpoint; infinity if time decides."""
-        return self._interval - done % self._interval
-
     def is_due(self, done: int, score: float | None) -> bool:
         """Return whether it is time for a checkpoint or the score is the best yet."""
         if score is not None and score > self._best_score:
             return True
-        if math.isinf(self._interval):
+        if math.isinf(self.interval.length):
             return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        return done % self._interval == 0
+        return self.interval.ends(done)
 
     def save(self, done: int, states: Any, record: checkpoint.Record) -> None:
         """Write a checkpoint, and delete older ones that need not be kept."""
@@ -275,6 +270,14 @@ def drive(
             trackers=trackers,
         )
     checkpoints = _Checkpoints(members, root, recording)
+    videos = None
+    if recording.video_every is not None:
+        # It imports MuJoCo, which not every training needs.
+        from gasil_jax.host.video import Videos
+
+        every, where = recording.video_every, folder / "videos"
+        videos = Videos(members, where, every=every, trackers=trackers)
+    intervals = [x.interval for x in (checkpoints, evaluation, videos) if x is not None]
     first, score = training.done, None
     # The finite returns since the last checkpoint, after an empty array.
     returns = [np.empty(0, np.float32)]
@@ -285,9 +288,12 @@ def drive(
     def evaluate() -> _Columns | None:
         nonlocal score
         score = None
-        if evaluation is None or not evaluation.is_due(training.done):
+        if evaluation is None:
             return None
-        with progress.aside("evaluating the policies"):
+        if training.left and not evaluation.interval.ends(training.done):
+            return None
+        first = "" if evaluation.seconds else "compiling and "
+        with progress.aside(f"{first}evaluating the policies"):
             scores = evaluation.score(training.states, training.done)
         mean = float(scores["mean"].mean(dtype=np.float64))
         score = mean if math.isfinite(mean) else None
@@ -312,8 +318,11 @@ def drive(
 
     started = time.monotonic()
     if training.left:
-        progress.phase("compiling", steps_of(first))
-        with interruption.answering(_AFTER_COMPILATION):
+        what = "compiling training and first states"
+        with (
+            interruption.answering(_AFTER_COMPILATION),
+            progress.aside(what, at_once=True),
+        ):
             training.compile()
     compile_seconds = time.monotonic() - started
 
@@ -324,10 +333,7 @@ def drive(
         evaluate()
     while training.left and not stopped and interruption.signal is None:
         done = training.done
-        most = checkpoints.iterations_left(done)
-        if evaluation is not None:
-            most = min(most, evaluation.iterations_left(done))
-        metrics = training.train_chunk(most)
+        metrics = training.train_chunk(min(x.left(done) for x in intervals))
         table.write(metrics)
         log(trackers, metrics)
         ended = metrics["episode_return"]
@@ -342,9 +348,13 @@ def drive(
         scores = evaluate()
         if checkpoints.is_due(training.done, score):
             save()
+        if videos is not None and (
+            not training.left or videos.interval.ends(training.done)
+        ):
+            videos.film(training.states, training.done, progress)
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
-    train_seconds = time.monotonic() - started
+    train_seconds = time.monotonic() - started - (videos.seconds if videos else 0.0)
     unsaved = None
     try:
         save()

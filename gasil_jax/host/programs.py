@@ -36,7 +36,7 @@ class Training(TypedDict):
       iterations: number of iterations that were trained.
       env_steps: environment steps over all members in the last process.
       compile_seconds: seconds of compiling.
-      train_seconds: seconds of training, without evaluations.
+      train_seconds: seconds of training, without evaluations and films.
       evaluation_seconds: seconds of evaluations; None without any.
       device: kind of the devices.
       device_count: number of devices.

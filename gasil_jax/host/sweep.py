@@ -60,6 +60,9 @@ class Recording:
         by default none. The untrained policy is evaluated too. The scores are undelayed
         returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation.
+      video_every: environment steps per seed between two films of the first seed's
+        policy, rounded up to whole iterations; by default none. They are in videos/ and
+        where `log` logs.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
@@ -67,6 +70,7 @@ class Recording:
     keep_checkpoints: int = 2
     evaluate_every: int | None = None
     evaluate_episodes: int = 10
+    video_every: int | None = None
     log: tuple[str, ...] = ()
 
 
@@ -216,7 +220,7 @@ class Sweep:
             raise InputError(
                 f"{option} is {folder}, where {'; '.join(changed)}: only total_steps "
                 "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
-                "devices and log may differ"
+                "video_every, devices and log may differ"
             )
         every = points.completed([*stored["points"], *self.points], *self.algorithms)
         return dataclasses.replace(self, points=every, start=stored.get("start"))

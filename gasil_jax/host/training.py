@@ -9,6 +9,7 @@ import jax
 from gasil_envs import user_code
 from gasil_jax import checks, train
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError
 from gasil_jax.host import devices, driver, environments, resources, trackers
 from gasil_jax.host.driver import Callback, Outcome
 from gasil_jax.host.interruption import Interrupted, Interruption
@@ -40,13 +41,19 @@ def prepare(
     num_members = sum(len(each.runs) for each in programs)
     devices.use_devices(sweep.settings, num_devices, num_members)
     env = make_env(sweep)
+    every = sweep.recording.video_every
+    if every is not None and not environments.can_be_drawn(env):
+        raise InputError(
+            f"video_every is {every}: {sweep.env} must have a function "
+            "draw(state, size), because nothing else can draw it"
+        )
     with announced(sweep.env, "starting the devices"):
-        every = jax.devices()
+        visible = jax.devices()
     algorithms = {x.algorithm.agent.name: x.algorithm for x in programs}
     for each in algorithms.values():
         _check(env, each)
     with announced(sweep.env, "tracing the first state"):
-        resources.check(env, programs, sweep.recording, every, folder)
+        resources.check(env, programs, sweep.recording, visible, folder)
     if num_devices is not None and 0 < num_members < num_devices:
         note(
             f"devices is {num_devices}, of which {num_members} are used, one for each "
