@@ -414,10 +414,7 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
-    """Print a note if the default preset has nothing for the agent and the task.
-
-    Other presets refuse an agent or a task that they have nothing for.
-    """
+    """Print a note if the default preset has nothing for the agent and the task."""
     for each in requested.algorithms:
         lacking = presets.describe_lack(
             options.env,

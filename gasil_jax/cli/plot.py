@@ -131,11 +131,7 @@ def _read_tables(
 
 
 def read_csv(path: pathlib.Path, label: str | None, columns: Sequence[str]) -> Curves:
-    """Return the curves of another library's CSV file, or of a folder of them.
-
-    Raises:
-      InputError: if two columns are not named, or a file lacks one or has no number.
-    """
+    """Return the curves of another library's CSV file, or of a folder of them."""
     if len(columns) != 2:
         raise InputError(
             f"columns has {len(columns)} names: {path} needs two, of x and the return"

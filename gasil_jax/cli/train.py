@@ -26,10 +26,7 @@ from gasil_jax.host.sweep import Sweep
 def train(
     options: Options, requested: Sweep, program: str, *, shard: tuple[int, int] = (1, 1)
 ) -> None:
-    """Train the runs of a shard that are missing in the folder of the options.
-
-    If no run is missing then, its results are written and told.
-    """
+    """Train the runs of a shard that the folder lacks; if it lacks none then, tell."""
     runs = requested.part(*shard)
     needed = requested.unfinished(options.out or NOWHERE, runs)
     with input_checked():

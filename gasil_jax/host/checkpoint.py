@@ -287,11 +287,7 @@ def delete_partial(root: pathlib.Path) -> None:
 
 
 def prune(root: pathlib.Path, keep: int) -> None:
-    """Delete all checkpoints but the newest `keep` and the best one.
-
-    A checkpoint that can't be deleted is left. `delete_partial` deletes it when
-    training continues.
-    """
+    """Delete all checkpoints but the newest `keep` and the best one, where possible."""
     try:
         folders = _folders(root)
         scores = _scores(folders)

@@ -234,22 +234,10 @@ def drive(
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
-    After each chunk a signal of `interruption` is answered with a checkpoint, and the
-    callback may end training. The trackers are closed at the end.
-
-    Args:
-      members: the members to train.
-      folder: the folder of metrics.csv, evaluations.csv and checkpoints/.
-      labels: columns that identify the members in the tables, (members,) each.
-      recording: what is recorded, and when.
-      steps_before: environment steps that `progress` has already counted.
-
-    Raises:
-      Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint has another state, if a table lacks rows, or if the
-        folder holds results but no undamaged checkpoint.
-      OSError: if the folder can't be written, or if the disk is full. If only the last
-        checkpoint can't, the outcome has the error.
+    After each chunk a signal is answered with a checkpoint and `Interrupted`, and the
+    callback may end training. The labels, (members,) each, identify the members in the
+    tables; `progress` has counted `steps_before` environment steps already. The
+    trackers are closed at the end.
     """
     root = folder / "checkpoints"
     training, record = _restored(members, root, progress)

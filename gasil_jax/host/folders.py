@@ -48,10 +48,7 @@ def create_new(name: str) -> pathlib.Path:
 
 
 def check_writable(folder: pathlib.Path) -> None:
-    """Raise `InputError` if the folder, or its first parent that exists, is read-only.
-
-    It is not created.
-    """
+    """Raise `InputError` if a folder, or where it would be made, is read-only."""
     existing = folder
     while not existing.exists():
         existing = existing.parent

@@ -35,16 +35,10 @@ _MOST_PARTS = 50
 def binned_returns(
     env_steps: np.ndarray, returns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean returns over equal parts of training, at most 50.
+    """Return the mean returns, (seeds, iterations), over 50 equal parts of training.
 
-    Parts in which not every seed has ended an episode are left out.
-
-    Args:
-      env_steps: (iterations,).
-      returns: (seeds, iterations), NaN where no episode ended.
-
-    Returns:
-      The steps at the end of each part, (parts,), and the means, (seeds, parts).
+    Parts in which not every seed has ended an episode are left out. They are given by
+    the steps at their ends, (parts,), and the means, (seeds, parts).
     """
     parts = np.array_split(np.arange(len(env_steps)), min(_MOST_PARTS, len(env_steps)))
     complete = [x for x in parts if np.isfinite(returns[:, x]).any(axis=1).all()]
@@ -89,19 +83,10 @@ def draw_returns(
     style: str = "-",
     unit: float = 1e6,
 ) -> None:
-    """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
+    """Draw the interquartile mean of returns, (seeds, points), and its 95% interval.
 
-    Args:
-      axes: where to draw.
-      env_steps: (points,).
-      returns: (seeds, points).
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each, whose interquartile mean is dashed; None if there are none.
-      color: color of the line, the interval and the evaluations.
-      label: label in the legend.
-      evaluated: label of the evaluations.
-      style: style of the line.
-      unit: number of steps that is 1 on the axis.
+    The interval is drawn from five seeds on. `evaluations` has "env_steps" and "mean",
+    (seeds, evaluations) each, drawn dashed; `unit` is the number of steps that is 1.
     """
     if len(env_steps):
         steps, middle = env_steps / unit, interquartile_mean(returns, axis=0)
@@ -135,10 +120,9 @@ def learning_curve(
     title: str,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Save the returns over environment steps as a PNG: all seeds, mean and interval.
+    """Save the returns, (seeds, iterations), as a PNG: all seeds, mean and interval.
 
-    Steps are (iterations,), and returns (seeds, iterations), NaN where no episode
-    ended; evaluations are as in `draw_returns`.
+    Evaluations are as in `draw_returns`.
     """
     from matplotlib.figure import Figure
 
@@ -174,17 +158,9 @@ def final_returns(
     env_steps: np.ndarray,
     curves: np.ndarray,
 ) -> None:
-    """Save every seed's final return in a row for each point, the best mean first.
+    """Save every seed's return, (points, seeds), in a row a point, the best mean first.
 
-    Beside them are the learning curves of the best points.
-
-    Args:
-      path: the image file.
-      labels: the name of each point.
-      returns: (points, seeds).
-      title: title of the picture.
-      env_steps: of each point's curves, (points, iterations).
-      curves: returns during training, (points, seeds, iterations).
+    Beside them are the best points' curves, (points, seeds, iterations).
     """
     from matplotlib.figure import Figure
 
@@ -232,15 +208,10 @@ def marginals(
     best: int | None,
     left_out: int,
 ) -> None:
-    """Save a panel for each hyperparameter: the points' returns over its values.
+    """Save a panel for each hyperparameter: the points' mean returns over its values.
 
-    Args:
-      path: the image file.
-      values: each point's value of every hyperparameter that varies, by name.
-      returns: each point's mean final return, (points,), all finite.
-      title: title of the picture.
-      best: index of the point that is marked as the best; None for none.
-      left_out: number of points without a return, which are not among these.
+    Returns are (points,), without the `left_out` points that have none; the `best` one
+    is marked.
     """
     from matplotlib.figure import Figure
 

@@ -146,12 +146,7 @@ class Progress:
             _line(self._title, f"warning: {text}")
 
     def update(self, steps: int, returns: np.ndarray) -> None:
-        """Show progress.
-
-        Args:
-          steps: environment steps so far, over all members.
-          returns: (members, iterations) of the last chunk, NaN where no episode ended.
-        """
+        """Show all members' steps, and the last returns, (members, iterations)."""
         each = [row[np.isfinite(row)] for row in returns]
         each = [row.mean() for row in each if row.size]
         if each:

@@ -211,9 +211,8 @@ def check_arrays(
 ) -> None:
     """Raise `InputError` if a single array of a traced program does not fit memory.
 
-    So a count that shapes an array is refused whatever it is, also a user's own. `need`
-    knows the arrays that are large together. The program itself is one function that
-    each of the devices runs.
+    So a count that shapes an array is refused whatever it is, also a user's own. The
+    program is one function that each of the devices runs.
     """
     inner = (x for part in core.subjaxprs(traced) for x in _arrays(part))
     largest, free = max(inner, key=_size, default=None), available(devices)

@@ -121,11 +121,7 @@ def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
 
 
 def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
-    """Write results.csv, curves.npz, the plots and summary.json; return the summary.
-
-    sweep.png and hyperparameters.png are of several points. policy.npz, which the
-    caller writes, has the policies of the best point by mean.
-    """
+    """Write results.csv, curves.npz, the plots and summary.json; return the summary."""
     sweep = results.sweep
     _write_results(folder / "results.csv", results)
     curves: dict[str, Any] = {**results.metrics}

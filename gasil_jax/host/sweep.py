@@ -260,10 +260,7 @@ def described(folder: pathlib.Path) -> Config:
 
 
 def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
-    """Return the sweep in a folder.
-
-    An algorithm that only Python can make is an argument.
-    """
+    """Return the sweep in a folder, with an algorithm that only Python can make."""
     return made(folder, described(folder), algorithm)
 
 

@@ -151,10 +151,7 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise `ValueError` for a tracker that is unknown, not installed or named twice.
-
-    A note says if Weights & Biases will be offline.
-    """
+    """Raise `ValueError` for a tracker that is unknown, not installed or repeated."""
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"log has {name!r} twice: name it once")

@@ -34,10 +34,7 @@ def prepare(
     *,
     num_devices: int | None = None,
 ) -> Any:
-    """Start the devices, check that everything works and fits; return the environment.
-
-    Nothing is compiled before this is done.
-    """
+    """Start the devices, check that all works and fits, and return the environment."""
     num_members = sum(len(each.runs) for each in programs)
     devices.use_devices(sweep.settings, num_devices, num_members)
     env = make_env(sweep)

@@ -123,11 +123,7 @@ def write_film(frames: Sequence[np.ndarray], fps: float, path: pathlib.Path) -> 
 def write_strip(
     env: Any, states: Sequence[Any], size: tuple[int, int], *, path: pathlib.Path
 ) -> int:
-    """Write up to eight pictures of an episode in two rows, each above its time.
-
-    The times are large enough to read when the strip, four pictures wide, fills a
-    column of a paper.
-    """
+    """Write up to eight pictures of an episode in two rows, each above its time."""
     from matplotlib import font_manager
     from PIL import Image, ImageDraw, ImageFont
 
