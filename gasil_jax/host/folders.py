@@ -119,10 +119,11 @@ def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
         for path in folder.iterdir()
     )
     if used:
-        more = ", or continue what is in it with --resume"
+        resume = "--resume" if option == "out" else "resume=True"
+        more = f", or continue what is in it with {resume}"
         raise InputError(
             f"{option} is {folder}, which is not empty: name a new or an empty folder"
-            f"{more if has_config(folder) and option == 'out' else ''}"
+            f"{more if has_config(folder) else ''}"
         )
 
 

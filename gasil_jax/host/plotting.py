@@ -9,9 +9,7 @@ import numpy as np
 
 from gasil_jax.statistics import (
     FEWEST_SEEDS,
-    are_numbers,
     bootstrap_interval,
-    groups,
     interquartile_mean,
 )
 
@@ -233,8 +231,6 @@ def marginals(
     named: dict[str, Any] = {"title": title, "title_fontsize": "large"}
     figure.legend(handles, labels, frameon=False, **named, **above)
     text = "point: mean over its seeds; mean: over the points of each value"
-    if any(len(groups(x)) < len(set(x)) for x in values.values()):
-        text += ", or of neighbouring values with fewer than two points each"
     if left_out:
         text += f"; {left_out} of {len(returns) + left_out} points are left out, "
         text += "because a seed has no return"
@@ -263,9 +259,8 @@ def _mark_tried(axes: Any, values: np.ndarray) -> None:
 def _draw_marginal(
     axes: Any, values: Sequence[Any], returns: np.ndarray, *, best: int | None
 ) -> None:
-    """Draw the points' returns over one hyperparameter, and the means of its groups."""
-    parts = groups(values)
-    if are_numbers(values):
+    """Draw the points' returns over one hyperparameter, and the mean of each value."""
+    if not isinstance(values[0], str):
         places, style = np.array(values, float), "-D"
         positive = places[places > 0.0]
         # In floats 3e-4 / 3e-5 is less than 10.
@@ -273,15 +268,14 @@ def _draw_marginal(
             # Values that are not positive lie on the linear part about 0.
             linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
             axes.set_xscale("symlog" if linear else "log", **linear)
-        distinct = np.unique(places)
-        if len(distinct) <= _MOST_TICKS:
-            _mark_tried(axes, distinct)
+        if len(tried := np.unique(places)) <= _MOST_TICKS:
+            _mark_tried(axes, tried)
     else:
         names = list(dict.fromkeys(values))
         places, style = np.array([names.index(x) for x in values]), "D"
         axes.set_xticks(range(len(names)), [str(name) for name in names])
-    centres = [np.median(places[part]) for part in parts]
-    means = [returns[part].mean() for part in parts]
+    centres = np.unique(places)
+    means = [returns[places == centre].mean() for centre in centres]
     axes.plot(centres, means, style, color=COLORS[0], markersize=6, label="mean")
     axes.plot(places, returns, "o", color="0.3", markersize=3, label="point")
     axes.margins(x=0.1)

@@ -207,6 +207,17 @@ class Sweep:
         }
         json_files.write(folder / folders.CONFIG, content)
 
+    def begun_in(
+        self, folder: pathlib.Path, *, resume: bool, option: str = "out"
+    ) -> "Sweep":
+        """Write config.json, and return this sweep as `continued_from` does."""
+        with folders.lock(folder, option=option, seconds=60.0):
+            if not resume or not folders.has_config(folder):
+                folders.refuse_used(folder, option=option)
+            grown = self.continued_from(folder, option=option)
+            grown.write(folder)
+        return grown
+
     def continued_from(self, folder: pathlib.Path, *, option: str = "out") -> "Sweep":
         """Return this sweep with the points of the one in the folder before its own.
 

@@ -30,7 +30,6 @@ def make_env(sweep: Sweep) -> Any:
 def prepare(
     sweep: Sweep,
     programs: Sequence[Program],
-    folder: pathlib.Path,
     *,
     num_devices: int | None = None,
 ) -> Any:
@@ -50,7 +49,7 @@ def prepare(
     for each in algorithms.values():
         _check(env, each)
     with announced(sweep.env, "tracing the first state"):
-        resources.check(env, programs, sweep.recording, visible, folder)
+        resources.check(env, programs, sweep.recording, visible)
     if num_devices is not None and 0 < num_members < num_devices:
         note(
             f"devices is {num_devices}, of which {num_members} are used, one for each "
