@@ -72,6 +72,29 @@ def validate_switch(name: str, value: Any) -> None:
         raise refusal(name, value, "True or False")
 
 
+def validate_key(key: Any) -> None:
+    """Raise `ValueError` unless this is a single random key, of either kind."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != jax.numpy.uint32:
+        raise refusal("key", key, "like jax.random.key(0)")
+    if typed and key.shape:
+        raise ValueError(
+            f"key has shape {key.shape}: it must be a single key (to train with "
+            "several, use jax.vmap)"
+        )
+
+
+def validate_state(state: Any) -> None:
+    """Raise `ValueError` unless this is the training state of one run."""
+    if not hasattr(state, "iteration"):
+        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
+    if shape := jax.numpy.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
+
+
 def validate_number(name: str, value: Any, allowed: Range) -> None:
     """Raise `ValueError` unless a value is a number in the range, or traced."""
     if shape := getattr(value, "shape", ()):

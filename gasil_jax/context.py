@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import wrappers
-from gasil_jax.buffer import History
 from gasil_jax.config import Config
 from gasil_jax.distributions import Distribution
 from gasil_jax.errors import shown
 from gasil_jax.normalization import Normalizer
-from gasil_jax.rollout import Rollout
+from gasil_jax.rollout import History, Rollout
 
 Metrics = dict[str, jax.Array]
 

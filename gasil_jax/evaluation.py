@@ -9,9 +9,9 @@ import numpy as np
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import checks, policy, train
+from gasil_jax import checks, policy, rollout
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import Range, validate_switch
+from gasil_jax.config import Range, validate_key, validate_switch
 from gasil_jax.errors import refusal, shown
 
 _COUNT = Range(1, 2**31 - 1, whole=True)
@@ -21,7 +21,7 @@ _COUNT = Range(1, 2**31 - 1, whole=True)
 def evaluate(
     env: Any,
     algorithm: Algorithm,
-    state: train.TrainState,
+    state: Any,
     *,
     key: jax.Array,
     num_episodes: int,
@@ -51,7 +51,7 @@ def evaluate(
         policy.from_state(state, env),
         key,
         num_episodes=num_episodes,
-        num_steps=train.max_episode_steps(env),
+        num_steps=rollout.max_episode_steps(env),
         deterministic=deterministic,
     )
 
@@ -75,7 +75,7 @@ def run_episodes(
         function or returns no actions.
     """
     checks.check_environment(env)
-    checks.check_key(key)
+    validate_key(key)
     if num_episodes not in _COUNT:
         raise refusal("num_episodes", num_episodes, _COUNT)
     validate_switch("deterministic", deterministic)

@@ -15,7 +15,7 @@ import numpy as np
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import numpy_policy, policy, train
+from gasil_jax import numpy_policy, policy, rollout, train
 from gasil_jax.agents.adversarial import AdversarialAgent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
@@ -258,7 +258,7 @@ def load_policies(
         names = [name for name in numpy_policy.SHARED if name in every]
         shared = {name: every.pop(name) for name in names}
         weights = [member(every, i) | shared for i in range(len(seeds))]
-        return Policies(env, train.max_episode_steps(env), seeds, weights)
+        return Policies(env, rollout.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":
         raise InputError(f"run is {folder}: it has no points and no checkpoints")
     arrays = numpy_policy.read(folder, seed)

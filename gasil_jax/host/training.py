@@ -7,7 +7,7 @@ from typing import Any
 import jax
 
 from gasil_envs import user_code
-from gasil_jax import checks, train
+from gasil_jax import checks, rollout, train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError
 from gasil_jax.host import devices, driver, environments, resources, trackers
@@ -81,7 +81,7 @@ def _note_if_no_episode_ends(env: Any, every: Sequence[Algorithm]) -> None:
     """Print a note if no episode can end within the steps of an environment."""
     for config in (algorithm.config for algorithm in every):
         steps = config.num_iterations * config.num_steps
-        limit = train.max_episode_steps(env)
+        limit = rollout.max_episode_steps(env)
         if steps < limit and not environments.ends_early(env):
             note(
                 f"no episode can end, so no return is known: each of {config.num_envs} "

@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from gasil_envs import pictures, wrappers
-from gasil_jax import policy, train
+from gasil_jax import policy, rollout
 from gasil_jax.host import output_file
 from gasil_jax.host.intervals import Interval
 from gasil_jax.host.members import Members, member
@@ -174,7 +174,7 @@ class Videos:
         self.interval, self.seconds = Interval(every, members.config), 0.0
         self._members, self._folder, self._trackers = members, folder, trackers
         self._works = True
-        steps = train.max_episode_steps(members.env)
+        steps = rollout.max_episode_steps(members.env)
         self._episode = make_episode(members.env, num_steps=steps)
 
     def film(self, states: Any, done: int, progress: Progress) -> None:
