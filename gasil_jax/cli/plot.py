@@ -55,23 +55,16 @@ class Options:
 
 
 class Curves(NamedTuple):
-    """The curves of one run.
+    """The curves of one run."""
 
-    Attributes:
-      env: the environment's name; empty if a file does not say it.
-      label: label in the legend.
-      env_steps: (points,), or what else is on the x axis.
-      returns: (seeds, points), mean return of the episodes since the previous point.
-      final: (seeds,), mean return over the last tenth of training.
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each; None if there are none.
-    """
-
-    env: str
-    label: str
-    env_steps: np.ndarray
+    env: str  # the environment's name; empty if a file does not say it
+    label: str  # label in the legend
+    env_steps: np.ndarray  # (points,), or what else is on the x axis
+    # (seeds, points), mean return of the episodes since the previous point.
     returns: np.ndarray
-    final: np.ndarray
+    final: np.ndarray  # (seeds,), mean return over the last tenth of training
+    # "env_steps" and "mean" of the evaluations during training, (seeds, evaluations)
+    # each; None if there are none.
     evaluations: Mapping[str, np.ndarray] | None
 
 

@@ -93,33 +93,23 @@ Callback = Callable[[FitProgress], bool | None]
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The result of training.
+    """The result of training."""
 
-    Attributes:
-      states: the members' states after the last iteration.
-      training: how this process trained.
-      unsaved: why the last checkpoint could not be written, to raise once the results
-        are written; None if it was.
-    """
-
-    states: Any
-    training: Training
+    states: Any  # the members' states after the last iteration
+    training: Training  # how this process trained
+    # Why the last checkpoint could not be written, to raise once the results are
+    # written; None if it was.
     unsaved: checkpoint.WriteError | None
 
 
 @dataclasses.dataclass
 class _Training:
-    """Members in training.
+    """Members in training."""
 
-    Attributes:
-      members: the members.
-      states: their states, padded once training is compiled; None for the first ones.
-      done: number of iterations so far.
-    """
-
-    members: Members
+    members: Members  # the members
+    # Their states, padded once training is compiled; None for the first ones.
     states: Any = None
-    done: int = 0
+    done: int = 0  # number of iterations so far
     _seconds_per_iteration: float = math.inf
 
     @property

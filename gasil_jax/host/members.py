@@ -100,20 +100,13 @@ class Members:
     """The members that train in one program.
 
     Their arrays are padded to a multiple of the number of devices: (padded, ...).
-
-    Attributes:
-      env: one environment.
-      algorithm: the algorithm that the members share.
-      seeds: absolute seed number of each member.
-      hyperparameters: the numbers of each member, by name.
-      devices: the devices that the members are sharded over.
     """
 
-    env: Any
-    algorithm: Algorithm
-    seeds: Sequence[int]
-    hyperparameters: Sequence[Mapping[str, Any]]
-    devices: Sequence[jax.Device]
+    env: Any  # one environment
+    algorithm: Algorithm  # the algorithm that the members share
+    seeds: Sequence[int]  # absolute seed number of each member
+    hyperparameters: Sequence[Mapping[str, Any]]  # the numbers of each member, by name
+    devices: Sequence[jax.Device]  # the devices that the members are sharded over
 
     @property
     def config(self) -> Config:

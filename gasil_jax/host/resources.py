@@ -28,17 +28,11 @@ _STATES_PER_EPISODE = 7
 
 
 class Need(NamedTuple):
-    """The bytes that one run needs.
+    """The bytes that one run needs."""
 
-    Attributes:
-      memory: memory during training.
-      largest_part: what most of the memory is for, in words.
-      shared: memory of what all runs on a device share, the agent's data.
-    """
-
-    memory: int
-    largest_part: str
-    shared: int = 0
+    memory: int  # memory during training
+    largest_part: str  # what most of the memory is for, in words
+    shared: int = 0  # memory of what all runs on a device share, the agent's data
 
 
 def check(

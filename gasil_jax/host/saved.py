@@ -229,18 +229,12 @@ def states_of(
 
 
 class Policies(NamedTuple):
-    """Saved policies.
+    """Saved policies."""
 
-    Attributes:
-      env: the environment that they were trained in.
-      num_steps: steps after which an episode is truncated, at the latest.
-      seeds: numbers of their seeds.
-      weights: the arrays of each, which `numpy_policy` describes.
-    """
-
-    env: Any
-    num_steps: int
-    seeds: Sequence[int]
+    env: Any  # the environment that they were trained in
+    num_steps: int  # steps after which an episode is truncated, at the latest
+    seeds: Sequence[int]  # numbers of their seeds
+    # The arrays of each, which `numpy_policy` describes.
     weights: Sequence[Mapping[str, np.ndarray]]
 
 

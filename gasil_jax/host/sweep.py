@@ -76,47 +76,32 @@ class Recording:
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """The trained policy that runs start from.
+    """The trained policy that runs start from."""
 
-    Attributes:
-      run: the folder of its run.
-      seed: its seed.
-      sha256: hash of its checkpoint.
-    """
-
-    run: str
+    run: str  # the folder of its run
     seed: int
-    sha256: str
+    sha256: str  # hash of its checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """The points and seeds of a folder.
-
-    Attributes:
-      env: name of the environment.
-      algorithm: the algorithm that the points change.
-      others: those of further agents, which are trained beside it. Then each point has
-        its "agent".
-      start: the trained policy that all runs start from; None starts from scratch.
-      seeds: absolute seed numbers.
-      points: changed settings, by name; all have the same names.
-      settings: settings of the environment.
-      recording: what is recorded.
-      preset: name of the preset that the settings began with.
-      only_python: why no command line can make the environment or the algorithm again;
-        None if one can.
-    """
+    """The points and seeds of a folder."""
 
     env: str
-    algorithm: Algorithm
-    seeds: Sequence[int]
+    algorithm: Algorithm  # the algorithm that the points change
+    seeds: Sequence[int]  # absolute seed numbers
+    # Changed settings, by name; all have the same names.
     points: Sequence[Point] = ({},)
     settings: Settings = dataclasses.field(default_factory=Settings)
     recording: Recording = dataclasses.field(default_factory=Recording)
-    preset: str | None = None
+    preset: str | None = None  # name of the preset that the settings began with
+    # Why no command line can make the environment or the algorithm again; None if one
+    # can.
     only_python: str | None = None
+    # Those of further agents, which are trained beside it. Then each point has its
+    # "agent".
     others: Sequence[Algorithm] = ()
+    # The trained policy that all runs start from; None starts from scratch.
     start: Start | None = None
 
     @property
