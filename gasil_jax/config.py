@@ -292,13 +292,7 @@ def ranges(kind: Any) -> Mapping[str, Range]:
 
 
 def validate(settings: Any) -> None:
-    """Check that every setting of a config, an agent or a reward model is allowed.
-
-    Numbers that are traced have no value yet: of those only the shapes are checked.
-
-    Raises:
-      ValueError: if a value is not allowed; the message names the value and the range.
-    """
+    """Raise `ValueError` unless a part's settings are allowed, as far as not traced."""
     for field in dataclasses.fields(settings):
         name, value = field.name, getattr(settings, field.name)
         if "check" not in field.metadata:
@@ -314,11 +308,7 @@ def validate(settings: Any) -> None:
 
 
 def validate_config(config: Config) -> None:
-    """Check that every value of a config is allowed, alone and with the others.
-
-    Raises:
-      ValueError: if a value is not allowed; the message names the value and the range.
-    """
+    """Raise `ValueError` unless a config is allowed, each value and all together."""
     validate(config)
     for name in ("num_envs", "minibatch_size"):
         size, batch_steps = getattr(config, name), config.batch_steps

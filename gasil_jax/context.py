@@ -82,11 +82,7 @@ class Context(struct.PyTreeNode):
 
 
 def merge_metrics(source: str, *groups: Metrics) -> Metrics:
-    """Return groups of metrics as one, float32 () by name.
-
-    Raises:
-      ValueError: if two have the same name, or one is not a single number.
-    """
+    """Return groups of metrics as one, float32 () by name, if no name is twice."""
     merged: Metrics = {}
     for name, value in (pair for group in groups for pair in group.items()):
         what = f"metric {shown(name)} of {source}"

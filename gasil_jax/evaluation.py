@@ -69,10 +69,6 @@ def run_episodes(
     """Do what `evaluate` does, with a policy ``act(observation, key)`` -> action.
 
     Episodes are truncated after `num_steps` steps.
-
-    Raises:
-      ValueError: as in `evaluate`, or if `env` is no environment, or if `act` is no
-        function or returns no actions.
     """
     checks.check_environment(env)
     validate_key(key)
@@ -123,17 +119,16 @@ def evaluate_in_gymnasium(
     seed: int = 0,
     num_steps: int | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run complete episodes of a policy in Gymnasium, with MuJoCo in C.
+    """Run complete episodes, one after the other, in Gymnasium, with MuJoCo in C.
 
     Args:
       gymnasium_id: name of the task, such as "Walker2d-v5".
       act: observation -> action, as from `numpy_policy.load`.
-      num_episodes: number of episodes, which run one after the other.
+      num_episodes: number of episodes.
       seed: seed of the first episode; each next episode has the next seed.
       num_steps: steps after which an episode is truncated; default the task's own.
 
-    Returns:
-      "episode_return" and "episode_length", (num_episodes,) each.
+    Returns what `evaluate` does.
     """
     import gymnasium  # Here alone: it takes long.
 

@@ -61,11 +61,7 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
 
 
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """Return the policy of a single `TrainState`, as `saved.load_policy` does.
-
-    Raises:
-      ValueError: if it is a batch of states, or none.
-    """
+    """Return the policy of a single `TrainState`, as `saved.load_policy` does."""
     validate_state(state)
     return make(weights(state, env))
 
