@@ -28,7 +28,6 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import note
-from gasil_jax.host.progress import announced
 from gasil_jax.host.sweep import Recording, Sweep
 from gasil_jax.rewards import REWARD_MODELS
 
@@ -136,10 +135,11 @@ def read(
     With --resume, options that are not given are those of the sweep in the folder,
     whose points come first; with --config those of a file; otherwise the preset's.
     """
-    if "--list-envs" in parsing.words(arguments):
+    words = parsing.words(arguments)
+    if "--list-envs" in words:
         print(*environments.names(), sep="\n")
         raise HelpShown(0)
-    first, stored = _first_options(arguments), None
+    first, stored = _first_options(words), None
     if first.resume:
         if first.out is None:
             raise InputError("resume needs --out and the folder to continue")
@@ -162,9 +162,9 @@ def read(
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
     _add_algorithms(parser, every)
-    values = parser.read(arguments, _why_not(every[0]))
+    values = parser.read(words, _why_not(every[0]))
     options = kind(**parser.fields(values, "run"))
-    given = {name: getattr(values, name) for name in parser.given(arguments)}
+    given = {name: getattr(values, name) for name in parser.given(words)}
     switches = [model.switch for model in REWARD_MODELS]
 
     def changed(algorithm: Algorithm) -> Algorithm:
@@ -214,7 +214,7 @@ def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
         parser.add_fields(type(other.agent), other.agent.name, other.agent)
 
 
-def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _first_options(words: Sequence[str]) -> argparse.Namespace:
     """Return the options that decide which others there are, and their defaults."""
 
     def delay(text: str) -> int:
@@ -231,7 +231,7 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rewards", nargs="*")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
-    return parser.parse_known_args(parsing.words(arguments))[0]
+    return parser.parse_known_args(words)[0]
 
 
 def _defaults(
@@ -311,8 +311,7 @@ def _action_size(env: str, preset: str) -> int | None:
         return None
     # The environment's arrays start JAX.
     devices.use_devices(Settings(), None, environments.available_cores())
-    with announced(env, "building the environment"):
-        built = environments.make_env(env)
+    built = environments.make_env(env)
     if environments.is_discrete(built):
         raise InputError(
             "preset is 'scaled', a rule for the dimension of an action: those of "
