@@ -243,7 +243,8 @@ def _piece(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     if most is None:
         return d < 0.0
     force = w * d
-    return jnp.sign(force) * (jnp.abs(force) >= most)
+    # One that is not a number is equal to itself, so that the iterations end.
+    return jnp.where(jnp.abs(force) >= most, jnp.sign(force), 0.0)
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
@@ -255,6 +256,8 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
       line_search: largest number of steps of each line search.
     """
     each = jax.tree.map
+    # A row that bends twice can send a search from one end to the other for ever.
+    pulls = any(most is not None for most in system.bound)
 
     def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
         """Return a function of each row; `others` are the last arguments."""
@@ -310,6 +313,9 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
+            if pulls:
+                other_end = jnp.where(first < 0.0, high, low)
+                inside &= jnp.abs(following - other_end) > 0.01 * (high - low)
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
             return (following, low, high, now), system.differ(before, now)

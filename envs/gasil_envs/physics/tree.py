@@ -29,9 +29,9 @@ FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_HINGE),
 )
 _NEGLIGIBLE = 1e-9
-#: From this distance from the origin on, metres, and this condition of the joint-space
-#: inertia on, rounding moves bodies by more than 1e-5 of their velocity in a step.
-_FAR, _UNEVEN = 20.0, 5e3
+#: From this distance from the origin on, metres and sizes of a body, and this condition
+#: of the joint-space inertia on, rounding costs more than 1e-5 of a step.
+_FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 5e3
 
 
 class Kinematics(NamedTuple):
@@ -87,9 +87,9 @@ def rounding(model: mujoco.MjModel) -> list[str]:
     own = np.sqrt(np.diag(inertia))
     away = np.linalg.norm(data.xpos[model.body_treeid >= 0], axis=1).max(initial=0.0)
     found = []
-    if away > _FAR:
+    if away > min(_FAR, _FAR_IN_SIZES * model.stat.meansize):
         found.append(
-            f"bodies {away:.0f} m from the origin, where positions are rounded to "
+            f"bodies {away:.3g} m from the origin, where positions are rounded to "
             f"{away * 1e-7:.0e} m"
         )
     if (condition := np.linalg.cond(inertia / np.outer(own, own))) > _UNEVEN:
