@@ -303,7 +303,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         quadratic = dot(direction, system.inertia_times(direction))
 
         def search_step(search: Any) -> Any:
-            step, low, high, before = search
+            (step, is_newton), low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
             bent = each(jnp.multiply, of_rows(_curvature, there), slope)
             second = quadratic + dot(bent, slope)
@@ -318,13 +318,16 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
                 inside &= jnp.abs(following - other_end) > 0.01 * (high - low)
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
-            return (following, low, high, now), system.differ(before, now)
+            # Newton's step within one piece is the last; half of the way is none.
+            goes_on = system.differ((before, is_newton), (now, is_newton | True))
+            return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
-        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), before)
-        step = system.repeat(
+        low, high = jnp.zeros_like(step), jnp.full_like(step, 1e3)
+        search = ((step, step > 0.0), low, high, before)
+        (step, _), *_ = system.repeat(
             search_step, search, least=1, most=line_search, is_short=True
-        )[0]
+        )
         qacc, moved = each(
             lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
         )
