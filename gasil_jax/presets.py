@@ -3,15 +3,10 @@
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
 the settings; a flag overrides a row.
 
-"tuned" has the settings that a search chose for an agent on a task, with the number of
-environments and the normalization of rewards that it ran with. Alpha suits only that
-normalization. Where the agent returns more with the learning rate, lambda, gamma and
-initial std that PPO's or PPO+GASIL's search chose, it has these
-(docs/results/ablations.md). The rows of locomotion tasks, and those of PPO and
-PPO+GASIL on the dense point mass, are from the stored searches; the other rows of the
-point mass are from earlier ones. Adaptive imitation has one setting for all tasks of
-MuJoCo but ant and humanoid with delayed rewards, where what its searches chose returns
-more than twice as much. An agent without a row for a task starts from the defaults.
+"tuned" has what a search chose for an agent on a task, with the number of environments
+and the normalization of rewards that it ran with; alpha suits only that normalization.
+Which rows are from which search is in docs/running.md. An agent without a row for a
+task starts from the defaults.
 
 "scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
 learning rate, exploration and lambda depend on the dimension of an action, which counts
@@ -23,8 +18,7 @@ for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy 
 
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
-each task (docs/results/paper_figures.md), and the defaults where we did not
-search. Rewards are normalized.
+each task (docs/results/paper_figures.md). Rewards are normalized.
 """
 
 import json
@@ -110,11 +104,9 @@ def _searched(rewards: str, adaptive: Overrides | None = None) -> Rows:
 def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     """Return settings that depend on the dimension of an action.
 
-    The searches suggest that the learning rate and the exploration must be smaller for
-    actions with more dimensions (docs/results/paper_figures.md). Noise in more
-    dimensions also makes the returns after an action vary more, so lambda falls too.
-    All three fall linearly from two dimensions to eight; more dimensions have the
-    values of eight (docs/results/ablations.md).
+    They fall linearly from two dimensions to eight, and are the same for more
+    (docs/results/ablations.md): with more dimensions the searches chose a smaller
+    learning rate and less exploration, and noise makes returns vary more.
     """
     share = min(max((action_size - 2) / 6, 0.0), 1.0)
 
