@@ -20,12 +20,13 @@ Of the buffer, only episodes with a return above m are imitated, as self-imitati
 learning (Oh et al. 2018) uses steps whose return is above the value. With R the mean
 return over their steps, and R_1 the best return,
 
-    q = clip((R - m) / (R_1 - m_0 + 0.01), 0, 1),
+    q = clip((R - m) / (R_1 - m_0 + 0.01 s), 0, 1),
 
 the share of all that was gained since the start that the policy still lacks; 0 if no
-episode is better. The buffer ranks episodes by their return plus 0.001 times their mean
-novelty, from 0 to 1, as in PPO+BC+NOVELTY. So where all returns are equal, as before
-the first reward, the policy imitates what is new, with a weight q below 0.1.
+episode is better. The buffer ranks episodes by their return plus 0.001 s times their
+mean novelty, from 0 to 1, like PPO+BC+NOVELTY's. So where all returns are equal, as
+before the first reward, the policy imitates what is new, with a weight q below 0.1. The
+number s is what rewards are divided by, so that their unit does not matter.
 """
 
 from typing import Any
@@ -35,7 +36,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax.agents.adversarial import BONUSES, PPOGASIL
-from gasil_jax.agents.novelty import PPONovelty, Visits
+from gasil_jax.agents.novelty import TIE, PPONovelty, Visits
 from gasil_jax.buffer import GoodTrajectories, mean_return
 from gasil_jax.config import choice
 from gasil_jax.context import Context, Metrics, Sizes
@@ -100,7 +101,7 @@ def moments(sums: jax.Array) -> tuple[jax.Array, jax.Array]:
 def progress(returns: Returns) -> jax.Array:
     """Return p, how fast the returns rise, from 0 to 1, ()."""
     mean, deviation = moments(returns.more)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-8
+    resolution = _EQUAL * jnp.abs(mean) + 1e-12
     rise = moments(returns.latest)[0] - mean
     # A steady rise of all returns gives a ratio of 0.8.
     return jnp.clip(2.0 * rise / (deviation + resolution), 0.0, 1.0)
@@ -109,21 +110,25 @@ def progress(returns: Returns) -> jax.Array:
 def better(buffer: GoodTrajectories, returns: Returns) -> GoodTrajectories:
     """Return the buffer without episodes that are no better than the policy's mean."""
     mean, _ = moments(returns.latest)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-8
+    resolution = _EQUAL * jnp.abs(mean) + 1e-12
     # They come first, because the buffer is sorted by return.
     is_better = buffer.filled & (buffer.return_ > mean + resolution)
     return buffer.replace(size=jnp.sum(is_better & (returns.latest[0] > 0)))
 
 
-def lack(good: GoodTrajectories, returns: Returns) -> jax.Array:
+def lack(
+    good: GoodTrajectories, returns: Returns, unit: jax.Array | float
+) -> jax.Array:
     """Return q, the share of the gain that the policy lacks, from 0 to 1, ().
 
     Args:
       good: the buffer's better episodes, from `better`.
       returns: the policy's returns.
+      unit: the number that rewards were divided by, (): the unit of the 0.01.
     """
     mean, _ = moments(returns.latest)
-    share = (mean_return(good) - mean) / (good.return_[0] - returns.lowest + _GAIN)
+    gained = good.return_[0] - returns.lowest + _GAIN * unit
+    share = (mean_return(good) - mean) / gained
     return jnp.where(good.size > 0, jnp.clip(share, 0.0, 1.0), 0.0)
 
 
@@ -148,13 +153,15 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
         )
 
     def remember(self, state: Any, context: Context) -> Any:
-        visits = self.count(state.visits, context)
-        novelty, rank = self.rank(state.novelty, visits, context)
+        batch, visits = context.rollout, self.count(state.visits, context)
+        novelty, total = self.follow_novelty(state.novelty, visits, context)
+        tie = TIE * context.reward_scale * total / batch.episode_length
+        rank = batch.discounted_return + tie
         return state.replace(
             visits=visits,
             buffer=self.insert(state.buffer, context, rank),
             novelty=novelty,
-            returns=follow(state.returns, context.rollout),
+            returns=follow(state.returns, batch),
         )
 
     def update_and_reward(
@@ -162,7 +169,7 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
     ) -> tuple[Any, jax.Array, Metrics]:
         good = better(state.buffer, state.returns)
         exploring = 1.0 - progress(state.returns)
-        imitating = exploring * lack(good, state.returns)
+        imitating = exploring * lack(good, state.returns, context.reward_scale)
         faded = self.replace(
             alpha=self.alpha * imitating,
             novelty_coefficient=self.novelty_coefficient * exploring,

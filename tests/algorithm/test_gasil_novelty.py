@@ -96,7 +96,7 @@ def test_equal_returns_are_no_progress_and_nothing_is_better_than_them(return_):
         returns = gasil_novelty.follow(returns, batch)
     np.testing.assert_allclose(gasil_novelty.progress(returns), 0.0, atol=1e-2)
     good = gasil_novelty.better(filled, returns)
-    assert good.size == 0 and gasil_novelty.lack(good, returns) == 0
+    assert good.size == 0 and gasil_novelty.lack(good, returns, 1.0) == 0
 
 
 def test_only_what_is_better_counts_and_by_the_share_that_is_lacked():
@@ -107,9 +107,11 @@ def test_only_what_is_better_counts_and_by_the_share_that_is_lacked():
     buffer = buffer.replace(return_=buffer.return_.at[:6].set(kept), size=jnp.int32(6))
     good = gasil_novelty.better(buffer, returns)
     assert good.size == 4
-    expected = (kept[:4].mean() - latest) / (kept[0] - lowest + 0.01)
+    expected = (kept[:4].mean() - latest) / (kept[0] - lowest + 0.07)
     assert 0.1 < expected < 0.9
-    np.testing.assert_allclose(gasil_novelty.lack(good, returns), expected, rtol=1e-4)
+    np.testing.assert_allclose(
+        gasil_novelty.lack(good, returns, 7.0), expected, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize(
