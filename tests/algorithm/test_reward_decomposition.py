@@ -1,7 +1,5 @@
 """Decomposition of delayed rewards against plain loops, and its use in training."""
 
-import types
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,31 +108,6 @@ def decompose_all(batches, failed=()):
             state, history, batch, key, rate
         )
         yield state, history, np.asarray(reward), metrics
-
-
-@pytest.mark.parametrize(("num_episodes", "complete"), [(1, 1), (4, 4)])
-def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, complete):
-    """A window as long as an episode is complete only where all of it is kept."""
-    history = new_history(1, num_episodes=num_episodes)
-    most = 0
-    for batch in range(30):
-        step = batch * NUM_STEPS + np.arange(NUM_STEPS)[:, None]
-        ended = (step + 1) % LIMIT == 0
-        zeros = np.zeros((NUM_STEPS, 1, OBS), np.float32)
-        steps = types.SimpleNamespace(
-            observation=zeros,
-            action=zeros[..., :ACT],
-            reward=np.float32(ended),
-            ended=ended,
-            next_observation=zeros,
-            faulty=False,
-            cut_short=False,
-        )
-        history = good_trajectories.record(history, steps)
-        windows = windows_of(history)
-        most = max(most, int(windows.ends.sum()))
-        assert (windows.length[windows.ends] == LIMIT).all()
-    assert most == complete
 
 
 def test_the_length_of_the_history_follows_the_agent_and_the_models():
@@ -346,11 +319,3 @@ def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():
     )
     for parts in (2, 3, 12):
         np.testing.assert_allclose(of(parts), of(1), rtol=1e-5)
-
-
-def test_large_inputs_are_read_in_as_few_parts_as_fit():
-    num_parts = decomposition.num_parts
-    assert num_parts(64, 32 * 40) == 1
-    assert num_parts(64, 32 * 713) == 4
-    assert num_parts(7, 2**18) == 7
-    assert num_parts(6, 2**30) == 6

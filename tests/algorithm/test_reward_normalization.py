@@ -63,11 +63,3 @@ def test_one_payment_an_episode_is_clipped_where_episodes_are_long():
     assert share[20] == 0.0 and share[1000] > 0.5
     nothing = jnp.zeros((5, 4))
     assert np.isnan(normalization.clipped(normalizer, nothing, 10.0))
-
-
-def test_no_reward_stays_none():
-    nothing = jnp.zeros((5, 2))
-    normalizer = normalization.update(
-        normalization.init(2), nothing, nothing > 0, gamma=0.99
-    )
-    assert not np.any(normalization.normalize(normalizer, nothing, 10.0))

@@ -15,13 +15,12 @@ import pytest
 
 import gasil_jax
 from experiments import __main__, engine
-from experiments.curves import Curve, Figure, difference
+from experiments.curves import Curve, Figure
 from experiments.engine import Setup
 from experiments.figures import FIGURES
 from experiments.store import RESULTS, Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host import programs
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.evaluations import evaluation_key
 from gasil_jax.host.interruption import Interrupted
@@ -69,38 +68,6 @@ def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
     for setup in (Setup(physics="mujoco"), Setup(evaluate_episodes=0)):
         (another,) = engine.unfinished(RUNS, setup)
         assert another.path not in {x.path for x in folders}
-
-
-@pytest.mark.parametrize(
-    ("agent", "numbers", "others"),
-    [
-        (
-            "ppo+gasil",
-            {"alpha": 0.5, "discriminator_learning_rate": 1e-3},
-            {"buffer_steps": 64, "bonus": "airl", "alpha_schedule": ((1e3, 0.0),)},
-        ),
-        (
-            "ppo",
-            {"decomposition_learning_rate": 1e-4, "reward_clip": 5.0},
-            {"decomposition_updates": 7, "normalize_rewards": False},
-        ),
-    ],
-)
-def test_an_agents_and_a_models_numbers_are_no_program_of_their_own(
-    agent, numbers, others
-):
-    models = {"decompose_rewards": True, "normalize_rewards": True}
-    first = Run("point_mass", gasil_jax.algorithm(agent, **SMALL, **models), 0)
-    changed = lambda name, value: dataclasses.replace(
-        first, algorithm=first.algorithm.replace(**{name: value})
-    )
-    alike = {changed(name, value) for name, value in numbers.items()}
-    apart = {changed(name, value) for name, value in others.items()}
-    every = programs.group([first, *alike, *apart])
-    assert {frozenset(program.runs) for program in every} == {
-        frozenset({first, *alike}),
-        *(frozenset({one}) for one in apart),
-    }
 
 
 def test_shards_are_all_runs_once_and_none_moves_when_others_join():
@@ -287,28 +254,6 @@ def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
     assert "![" in (results / f"{name}.md").read_text()
 
 
-def test_a_small_version_is_trained(toy, tmp_path, monkeypatch, capsys):
-    panels = {"a": toy.panels["a"], "b": toy.panels["a"]}
-    both = (*difference("a", "x", "y"), *difference("b", "y", "x"))
-    compared = {("a", "x", "y"): both[:2], ("b", "x", "y", "a"): both}
-    figure = dataclasses.replace(toy, panels=panels, comparisons=compared)
-    monkeypatch.setitem(FIGURES, "matrix", figure)
-    monkeypatch.setattr(__main__, "_QUICK_STEPS", 512)
-    arguments = ["--runs", str(tmp_path), "--evaluate-episodes", "0", "--devices", "1"]
-    assert __main__.main(["matrix", "--quick", *arguments]) == 0
-    page = (tmp_path / "quick" / "results" / "matrix.md").read_text()
-    assert "![" in page and len(list((tmp_path / "quick/results").glob("*.png")))
-
-
-def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
-    figure = __main__._small(FIGURES["delayed_rewards"], ["hopper-delayed"])
-    decomposed = {
-        name: curve.runs(Store(tmp_path))[0].algorithm.settings["decompose_rewards"]
-        for _, name, curve in figure.curves()
-    }
-    assert decomposed["ppo (decomposed)"] and not decomposed["ppo"]
-
-
 def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, capsys):
     # The default folder of results, given as a relative path, is no other folder.
     results = ["--results", os.path.relpath(RESULTS)]
@@ -347,12 +292,6 @@ def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
     assert __main__.main([*arguments]) == 2
     error = capsys.readouterr().err
     assert message in error and len(error.splitlines()) == 1
-
-
-def test_without_a_name_the_figures_are_listed(capsys):
-    assert __main__.main([]) == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in (*FIGURES, "report", "benchmark"))
 
 
 TWO_CORES = pytest.mark.skipif(
@@ -437,12 +376,3 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
     assert not list(tmp_path.glob("runs/*/*/training.json"))
     assert __main__.main([*command, "--resume", "--processes", "2"]) == 0
     assert "Not trained yet" not in (tmp_path / "matrix.md").read_text()
-
-
-def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
-    runs = [run(seed) for seed in range(5)] + [run(seed) for seed in (1000, 1001)]
-    every = engine.unfinished(runs, Setup(members=2))
-    assert sorted(len(program.runs) for program in every) == [1, 2, 2, 2]
-    assert {x for program in every for x in program.runs} == set(runs)
-    for program in every:
-        assert len({run.seed >= 1000 for run in program.runs}) == 1

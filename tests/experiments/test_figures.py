@@ -1,7 +1,6 @@
 """The runs that the figures request."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from experiments.curves import Arm, Curve, Figure, grid
 from experiments.figures import FIGURES
 from experiments.search import DELAY, PAIR, Search
 from experiments.store import RESULTS, Record, Store
-from gasil_jax import presets
 from gasil_jax.algorithms import check
 
 STORE = Store(RESULTS / "runs")
@@ -50,12 +48,6 @@ def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
         runs = curve.runs(store)
         assert [run.seed for run in runs] == list(range(20))
         assert runs[0].algorithm == first[0].algorithm
-
-
-def test_noise_is_trained_with_what_was_chosen_without():
-    for curves in FIGURES["stochastic_walker2d"].panels.values():
-        for curve in curves.values():
-            assert curve.search == Search("walker2d", curve.agent)
 
 
 def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
@@ -117,30 +109,3 @@ def test_a_figure_over_delays_is_a_row():
     # Agents are compared where the delay is the same.
     others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
     assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]
-
-
-def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path):
-    panels = FIGURES["action_dimension"].panels
-    for env, size, inverse, both in (
-        ("swimmer", 2, 1.0, (0.975, 0.9975)),
-        ("humanoid", 17, 2 / 17, (0.9, 0.99)),
-    ):
-        scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
-        by_root = scaled.replace(
-            learning_rate=1.5e-3 / size,
-            initial_std=1 / math.sqrt(size),
-            gae_lambda=1 - math.sqrt(size) / 40,
-        )
-        algorithms = [
-            curve.runs(Store(tmp_path))[0].algorithm
-            for name, curve in panels[f"{env}-delayed"].items()
-            if name != "ppo"
-        ]
-        assert scaled.settings["decompose_rewards"]
-        assert algorithms == [
-            scaled,
-            by_root,
-            by_root.replace(gae_lambda=0.95),
-            by_root.replace(gae_lambda=0.95, initial_std=inverse),
-            by_root.replace(gae_lambda=both[0], gamma=both[1]),
-        ]

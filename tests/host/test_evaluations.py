@@ -152,16 +152,14 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     assert_same_tables(out, whole)
 
 
-@pytest.mark.parametrize(("at", "scored"), [(0, ["0"]), (10, ["0", "640"])])
-def test_an_interrupted_run_continues_with_its_scores(
-    at, scored, evaluated, tmp_path, monkeypatch
+def test_a_run_that_is_stopped_before_it_trains_scores_each_policy_once(
+    evaluated, tmp_path, monkeypatch
 ):
-    """Even one that is stopped before it trains scores each policy once."""
     whole, out = evaluated[0], tmp_path / "out"
     score = Evaluation.score
 
     def interrupted(self, states, done):
-        if done == at:
+        if done == 0:
             os.kill(os.getpid(), signal.SIGTERM)
         return score(self, states, done)
 
@@ -169,7 +167,7 @@ def test_an_interrupted_run_continues_with_its_scores(
         patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
-    assert [row["env_steps"] for row in rows(out)[::3]][: len(scored)] == scored
+    assert [row["env_steps"] for row in rows(out)[::3]][:1] == ["0"]
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert_same_tables(out, whole)
 

@@ -267,16 +267,10 @@ BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"seeds": jnp.zeros(2, int)}, r"seeds is \[0, 0\]: it must be different"),
-        ({"seeds": [-1]}, "different whole numbers"),
         ({"checkpoint_every": 128}, "checkpoint_every is 128: it needs a folder"),
         ({"resume": True}, "resume is True: it needs a folder"),
-        ({"folder": "/proc/none"}, "folder is /proc/none"),
         ({"folder": "full"}, "folder is .* not empty"),
-        (BEGUN | {"evaluate_every": None}, "evaluate_every was 128, is None"),
         (BEGUN | {"evaluate_every": 256}, "evaluate_every was 128, is 256: only total"),
-        (BEGUN | {"evaluate_episodes": 3}, "evaluate_episodes was 10, is 3: only tot"),
-        ({"points": []}, r"points is \[\]: it must be a list of at least one dict"),
         ({"points": [{"alpha": 1.0}]}, "alpha is a setting of .*, not of ppo"),
         ({"points": [{"num_epochs": 2}]}, "num_epochs is not traced"),
     ],

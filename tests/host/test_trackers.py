@@ -109,29 +109,22 @@ def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
     assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
-def first_made(monkeypatch, program, *arguments):
-    """Return the name and the settings of the first run that trackers are told of."""
+def test_a_program_of_a_sweep_is_told_with_its_own_values(
+    tmp_path, monkeypatch, capsys
+):
+    """And with the name of the sweep's folder."""
+    monkeypatch.chdir(tmp_path)
     told = []
 
     def make(names, folder, *, run_name, config, members):
-        told.append((run_name, config))
+        told.append((run_name, config["num_epochs"]))
         raise InputError("enough")
 
     monkeypatch.setattr(trackers, "make", make)
     monkeypatch.setattr(trackers, "check", lambda names: None)
-    log = ("--log", "tensorboard")
-    assert program.main([*SMALL, *log, *map(str, arguments)]) == 2
-    (first,) = told
-    return first
-
-
-def test_runs_have_the_names_of_their_folders(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert first_made(monkeypatch, run, "--out", "programs/7")[0] == "7"
-    grid = ("--grid", "num_epochs=2,3", "--out", "beta")
-    name, config = first_made(monkeypatch, sweep, *grid)
-    # A program of a sweep is told with its own values.
-    assert (name, config["num_epochs"]) == ("beta", 2)
+    grid = ("--grid", "num_epochs=2,3", "--out", "programs/7")
+    refused(capsys, sweep, *SMALL, "--log", "tensorboard", *grid)
+    assert told == [("7", 2)]
 
 
 def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, capsys):
