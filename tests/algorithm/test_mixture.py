@@ -99,33 +99,6 @@ def test_an_untrained_policy_has_the_initial_std_and_components_apart():
     np.testing.assert_allclose(drawn.std(axis=0), 0.25, rtol=0.1)
 
 
-def test_cloning_of_two_ways_keeps_both_where_a_gaussian_takes_their_mean():
-    """Actions of -1 and 1 in the same state: the gradient parts the components."""
-    action = jnp.array([[-1.0], [1.0]]).repeat(32, axis=0)
-
-    def cloned(distribution, components):
-        network = distribution.network((8,), 1, components=components)
-        params = network.init(jax.random.key(0), jnp.zeros(2))
-        params = distribution.explore(params, 0.5)
-
-        def loss(params):
-            parameters = network.apply(params, jnp.zeros((64, 2)))
-            return -distribution.log_prob(parameters, action).mean()
-
-        def step(params, _):
-            gradient = jax.grad(loss)(params)
-            return jax.tree.map(lambda p, g: p - 0.02 * g, params, gradient), None
-
-        params, _ = jax.lax.scan(step, params, length=1000)
-        parameters = network.apply(params, jnp.zeros((5_000, 2)))
-        return np.asarray(distribution.sample(jax.random.key(1), parameters))
-
-    between = lambda drawn: np.mean(np.abs(drawn) < 0.5)
-    assert between(cloned(GAUSSIAN, 1)) > 0.3
-    drawn = cloned(MIXTURE, 2)
-    assert between(drawn) < 0.02 and np.mean(drawn > 0) == pytest.approx(0.5, abs=0.05)
-
-
 # The other agents use nothing of a policy that this one does not.
 def test_replays_train_it():
     env, algorithm = gasil_jax.make_env("point_mass"), gasil_jax.algorithm("ppo+sil")

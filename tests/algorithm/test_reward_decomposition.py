@@ -110,30 +110,6 @@ def decompose_all(batches, failed=()):
         yield state, history, np.asarray(reward), metrics
 
 
-def test_the_length_of_the_history_follows_the_agent_and_the_models():
-    env = gasil_jax.make_env("point_mass")
-    history = lambda *parts: (
-        jax.eval_shape(
-            lambda: gasil_jax.init(
-                env, gasil_jax.Algorithm(*parts, config=CONFIG), jax.random.key(0)
-            )
-        ).history
-    )
-    length = lambda *parts: history(*parts).reward.shape[1]
-    ppo, buffered = gasil_jax.PPO(), gasil_jax.PPOGASIL()
-    long = MODEL.replace(decomposition_history_episodes=3)
-    for episodes, *parts in (
-        (1, ppo, (MODEL,)),
-        (1, buffered),
-        (1, buffered, (MODEL,)),
-        (3, ppo, (long,)),
-        (3, buffered, (long,)),
-    ):
-        steps = episodes * env.episode_length + NUM_STEPS
-        assert length(*parts) == -(-steps // NUM_STEPS) * NUM_STEPS
-    assert history(ppo, (gasil_jax.Normalize(),)) is None
-
-
 def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_paid():
     """Also one that began in an earlier batch, for a replay of whole episodes."""
     batches, steps, begin_before = list(random_batches(0, 9)), [], 0

@@ -13,7 +13,7 @@ from small_training import drawn_policies
 
 import gasil_jax
 from gasil_jax import evaluate, evaluation, numpy_policy, policy
-from gasil_jax.host import checkpoint, saved
+from gasil_jax.host import checkpoint
 
 # With the other tests that use it, so that it is trained once.
 on_trained = pytest.mark.xdist_group("commands")
@@ -58,15 +58,6 @@ def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
     capsys.readouterr()
     told = refused(capsys, evaluate, out, "--checkpoint", "best")
     assert f"{best} is damaged: state/_METADATA is not what was written" in told
-
-
-@on_trained
-def test_the_saved_policies_are_those_of_the_last_checkpoint(trained):
-    env, _, seeds, states = saved.load(trained.folder, seed=6)
-    assert seeds == [6]
-    expected = policy.weights(states, env)
-    for name, weight in numpy_policy.read(trained.folder, 6).items():
-        np.testing.assert_allclose(weight, np.squeeze(expected[name]), rtol=1e-6)
 
 
 def test_gymnasiums_episodes_have_the_runs_limit():

@@ -3,6 +3,7 @@
 import pytest
 from refusals import refused, rows
 
+from experiments import __main__ as experiments
 from gasil_jax import evaluate, plot, render, run, sweep
 from gasil_jax.host import output_file
 
@@ -14,6 +15,7 @@ PROGRAMS = {
     "sweep": (sweep, "--env point_mass "),
     "grid": (sweep, "--env point_mass --grid "),
     "shard": (sweep, "--env point_mass --grid alpha=1 --out x "),
+    "figure": (experiments, ""),
     "evaluate": (evaluate, ""),
     "plot": (plot, ""),
     "score": (evaluate, "RUN "),
@@ -110,6 +112,14 @@ shard --shard 5/4 | shard is '5/4'
 shard --shard 1/2 | 1 runs (points x seeds) make 1
 shard --launcher ray | None: --launcher needs --shards
 shard --launcher ray --shards 2 | make 1 shards
+figure nonsense | experiment 'nonsense' is unknown: it must be one of
+figure matrix --only hoper | only 'hoper' is unknown: did you mean 'hopper'
+figure matrix --shard 3/2 | --shard: invalid shard value: '3/2'
+figure matrix --devices 0 | --devices: 0: it must be 1 or more
+figure matrix --quick --results x | results is x: --quick writes below
+figure report --help-me | unrecognized arguments: --help-me
+figure benchmark --tables speed | --tables: invalid choice: 'speed' (ch
+figure benchmark --repeats 9 --page | page is set, but
 evaluate | RUN is missing: see --help
 evaluate LONGx | too long
 evaluate zoo:nothing | nothing
@@ -144,9 +154,6 @@ draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
 draw --smooth 0 | smooth is 0: it must be 1 or more
 draw --x steps | x 'steps' is unknown
 draw --out x.txt | must end in .png, .pdf, .svg
-draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
-draw --smooth 0 | smooth is 0: it must be 1 or more
-draw --x steps | x 'steps' is unknown: did you mean 'env_steps'
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png
 draw --out RUN/summary.png --point 1 | point is 1: 

@@ -127,10 +127,3 @@ except ImportError:
     command = [sys.executable, "-c", code]
     done = subprocess.run(command, env=unset, capture_output=True, text=True)
     assert done.stdout.split() == ["disable"], done.stderr
-
-
-def test_a_missing_package_is_named(trained, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    path = tmp_path / "film.mp4"
-    assert render.main([str(trained.folder), "--out", str(path)]) == 2
-    assert "needs the package imageio-ffmpeg" in capsys.readouterr().err

@@ -1,14 +1,12 @@
 """The profile's table, and the parts that operations belong to."""
 
-import functools
 from types import SimpleNamespace
 
 import jax
 import pytest
 
 from experiments import __main__ as experiments
-from experiments import benchmark, measured, profile
-from gasil_envs.physics import batching
+from experiments import measured, profile
 
 
 @pytest.fixture
@@ -98,17 +96,3 @@ xla_cpu_small_call="true"}, metadata={op_name="jit(f)/vmap(physics)/jit(tiled)"}
         "sort.1": "PPO: permutations",
         "add.1": "the rest",
     }
-
-
-def test_mjx_is_timed_in_a_process_without_the_option_of_our_loops(monkeypatch):
-    monkeypatch.setattr(benchmark, "_FLAGS", "")
-    monkeypatch.setenv("XLA_FLAGS", "")
-    batching.keep_loops("jax")
-    option = "'disable_loop_unrolling' in __import__('os').environ['XLA_FLAGS']"
-    build = functools.partial(
-        benchmark.Row, "ant", "mjx", 8, functools.partial(eval, option)
-    )
-    assert build().run() and benchmark._row("ours", build).run()
-    row = benchmark._row("mjx", build)
-    assert (row.name, row.num_envs) == ("mjx", 8)
-    assert row.run() == row.run() == 0.0

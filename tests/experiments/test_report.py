@@ -7,18 +7,16 @@ import re
 
 import numpy as np
 import pytest
-from test_figures import DELAYS
 
 from experiments import (
     claims,
     comparisons,
     doing_nothing,
-    figure_results,
     plots,
     report,
     tables,
 )
-from experiments.curves import Arm, Curve, Figure, grid
+from experiments.curves import Curve, Figure, grid
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
 from experiments.search import solved_from
@@ -63,11 +61,6 @@ def results(tmp_path):
 def published():
     """The results of all figures."""
     return report.all_results(Store(RESULTS / "runs"))
-
-
-@pytest.fixture(scope="module")
-def nothing_measured(tmp_path_factory):
-    return report.all_results(Store(tmp_path_factory.mktemp("empty")))
 
 
 @pytest.mark.parametrize("name", report.NAMES)
@@ -132,15 +125,6 @@ def test_slots(results):
         value("x", "final", "one", "mine")
 
 
-def test_a_block_is_made_anew(nothing_measured):
-    value = functools.partial(report.value, nothing_measured)
-    text = "before\n<!-- begin claims -->\nold\n<!-- end -->\nafter"
-    filled = report.fill_blocks(text, value)
-    made = claims.table(nothing_measured)
-    assert filled == text.replace("old\n", f"\n{made}\n\n")
-    assert report.fill_blocks(filled, value) == filled
-
-
 def test_every_number_is_in_the_tables(results):
     head, *rows = report.curves_table({"x": results})
     row = dict(zip(head, rows[0], strict=True))
@@ -169,64 +153,6 @@ def test_a_page_is_written_with_its_pictures(results, tmp_path):
     page = (tmp_path / "page.md").read_text()
     assert "# Title\n\n**The paper's claim.** Claim.\n\n![" in page
     assert "](x_forest_dense.png)\n\n<details" in page
-
-
-def test_a_figure_over_delays_is_drawn_and_compared(tmp_path):
-    store, records = Store(tmp_path / "runs"), {}
-    for i, (_, _, curve) in enumerate(DELAYS.curves()):
-        for run in curve.runs(store):
-            value = 100.0 + i % 2 * run.settings.reward_delay + run.seed
-            records[run] = constant(value)
-    store.add(records)
-    results = Results("delays", DELAYS, store)
-    rows = {row.name: row for row in results.forest()}
-    assert len(rows) == 4
-    assert [*rows["ppo+gasil-1 − ppo-1"].verdicts.values()] == ["not clear"] * 2
-    assert [*rows["ppo+gasil-1000 − ppo-1000"].verdicts.values()] == ["better"] * 2
-    # An agent has the color that it has where learning curves are drawn.
-    styles = plots._lines(FIGURES["matrix"])
-    lines = {x.get_label(): x for x in plots.curves(results).axes[0].containers}
-    for agent in ("ppo", "ppo+gasil"):
-        assert lines[agent].lines[0].get_color() == styles[agent]["color"]
-
-
-@pytest.mark.parametrize("name", FIGURES)
-def test_a_picture_can_be_read(name):
-    figure = FIGURES[name]
-    lines = plots._lines(figure)
-    assert {*figure.shown} <= lines.keys()
-    colors = [str(x["color"]) for x in lines.values()]
-    assert len({*colors}) == len(colors)
-    notes = "".join(map(report.note, (*report.NAMES, "front")))
-    if f"{{{{{name} curves" in notes:
-        points = {
-            x: {figure.point_of(x, y)[0] for y in figure.panels[x]}
-            for x in figure.panels
-        }
-        assert max(len(x & lines.keys()) for x in points.values()) <= plots.MOST_LINES
-        assert (
-            any(x["linewidth"] > 2 for x in lines.values()) or name == "hyperparameters"
-        )
-
-
-def test_the_mean_over_tasks_stands_beside_them(tmp_path, monkeypatch):
-    units = {"hopper": 1000.0, "swimmer": 50.0, "ant": 10.0}
-    monkeypatch.setattr(figure_results, "unit", lambda env, store: units[env])
-    arms = ["ppo", "ppo+bc", Arm("more", "ppo+gasil")]
-    panels = grid([*units], arms, base=None, seeds=6)
-    store = Store(tmp_path / "runs")
-    for panel, curves in panels.items():
-        for i, curve in enumerate(curves.values()):
-            runs = curve.runs(store)
-            store.add(dict.fromkeys(runs, constant(units[panel] * (1 + i))))
-    results = Results("x", Figure("", "", panels, favourite="more"), store)
-    whole = results.whole([*units])
-    assert [x[0] for x in whole.values()] == [1.0, 2.0, 3.0]
-    *drawn, last = [x for x in plots.curves(results).axes if x.get_visible()]
-    assert [x.get_title() for x in drawn] == [*units]
-    assert [x.get_text() for x in last.texts] == [*whole]
-    # Panels that share a task have no mean.
-    assert not results.whole(["hopper", "hopper", "ant"])
 
 
 def test_a_page_tells_shares_and_who_is_sooner(tmp_path):
