@@ -113,7 +113,6 @@ shard --shard 1/2 | 1 runs (points x seeds) make 1
 shard --launcher ray | None: --launcher needs --shards
 shard --launcher ray --shards 2 | make 1 shards
 figure nonsense | experiment 'nonsense' is unknown: it must be one of
-figure matrix --only hoper | only 'hoper' is unknown: did you mean 'hopper'
 figure matrix --shard 3/2 | --shard: invalid shard value: '3/2'
 figure matrix --devices 0 | --devices: 0: it must be 1 or more
 figure matrix --quick --results x | results is x: --quick writes below

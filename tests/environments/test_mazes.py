@@ -31,15 +31,17 @@ def test_reset_and_step(name):
     assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()
 
 
-@pytest.mark.parametrize("name", ["hopper", "halfcheetah_noisy"])
+@pytest.mark.parametrize("name", ["hopper", "halfcheetah"])
 def test_a_robot_is_paid_for_each_healthy_step_beyond_its_distance_alone(name):
-    env = gasil_envs.make(f"sparse:{name}")
-    user_environment.check(name, env.env, env)
+    # With MuJoCo's physics, of which nothing takes long to compile.
+    task = gasil_envs.make(f"sparse:{name}").unwrapped.task
+    env = locomotion.Locomotion(task, physics="mujoco")
+    user_environment.check(name, env, env)
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     check_reset_and_step(env, reset, step)
     start = reset(jax.random.split(jax.random.key(0), BATCH))
     physics = start.pipeline_state.physics
-    metres = mazes.ROBOTS[name.removesuffix("_noisy")]
+    metres = mazes.ROBOTS[name]
     moved = metres + jnp.linspace(-0.1, 0.1, BATCH)
     # Every other robot lies on its head, which ends a hopper's episode.
     qpos = physics.qpos.at[:, 0].set(moved).at[::2, 2].set(2.0)

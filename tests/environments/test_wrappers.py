@@ -8,7 +8,6 @@ from brax.envs import Env, State
 
 import gasil_envs
 from gasil_envs import wrappers
-from gasil_jax.evaluation import run_episodes
 
 
 class Scripted(Env):
@@ -71,27 +70,6 @@ def test_the_phase_of_a_delay_is_seen():
     np.testing.assert_array_equal(seen.obs[:, -1], [0.25, 0.5, 0.75, 0.0, 0.25, 0.5])
     np.testing.assert_array_equal(seen.obs[:, :-1], plain.obs)
     np.testing.assert_array_equal(seen.reward, plain.reward)
-
-
-class DoneFromTheStart(Scripted):
-    """Says that it has ended in its reset, and leaves that as it is."""
-
-    def reset(self, rng):
-        return super().reset(rng).replace(done=jnp.float32(1))
-
-    def step(self, state, action):
-        return super().step(state, action).replace(done=state.done)
-
-
-@pytest.mark.parametrize("limited", [False, True])
-def test_no_episode_ends_with_its_reset(limited):
-    env = DoneFromTheStart(100)
-    if limited:
-        env = wrappers.EpisodeLimit(env, 100)
-        assert not roll(env, 7)[1].done.any()
-    act = lambda observation, key: jnp.zeros((len(observation), 1))
-    scores = run_episodes(env, act, jax.random.key(0), num_episodes=2, num_steps=7)
-    np.testing.assert_array_equal(scores["episode_length"], [7, 7])
 
 
 class WithTrueReward(Scripted):

@@ -165,7 +165,7 @@ def toy(monkeypatch):
     """A figure of two small curves on the point mass."""
     changes = {**SMALL, "total_steps": 512}
     curve = Curve("point_mass", "ppo", seeds=4, changes=changes)
-    other = dataclasses.replace(curve, agent="ppo+bonus")
+    other = dataclasses.replace(curve, changes={**changes, "gamma": 0.9})
     figure = Figure("Toy", "None.", {"a": {"x": curve, "y": other}}, favourite="x")
     monkeypatch.setitem(FIGURES, "matrix", figure)
     return figure

@@ -129,18 +129,6 @@ def test_a_sweep_is_sorted_and_the_best_points_have_curves(figures, tmp_path):
     assert curves.get_xlabel() == "steps" and figure.get_suptitle() == "hopper, ppo"
 
 
-def test_a_short_run_is_drawn_in_thousands_and_ticks_have_no_offset(figures, tmp_path):
-    steps = np.arange(1, 11) * 4000.0
-    returns = 500.0 + np.linspace(0, 0.01, 10) * np.ones((2, 1))
-    plotting.learning_curve(tmp_path / "x.png", steps, returns, title="hopper, ppo")
-    (axes,) = figures[0].axes
-    assert axes.get_xlabel() == "thousand steps of a seed"
-    assert axes.get_lines()[0].get_xdata()[-1] == 40.0
-    figures[0].draw_without_rendering()
-    assert axes.yaxis.get_offset_text().get_text() == ""
-    assert axes.get_title() == "hopper, ppo"
-
-
 def test_a_moving_mean_is_of_the_points_before():
     smoothed = plotting.smoothed(np.array([[1.0, 3.0, 5.0, 7.0]]), 2)
     np.testing.assert_allclose(smoothed, [[1.0, 2.0, 4.0, 6.0]])

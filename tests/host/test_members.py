@@ -34,23 +34,6 @@ def compiled(agent):
     return members, jax.tree.map(jnp.asarray, members.trim(states)), advance
 
 
-@pytest.mark.xdist_group("members ppo+gasil")
-def test_the_members_of_padded_states_are_taken_on_the_host():
-    """Sliced by JAX, each device would get the states of all members."""
-    members, states, _ = compiled("ppo+gasil")
-    states = members.trim(members.to_devices(states))
-    arrays = [
-        jax.random.key_data(x)
-        if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-        else x
-        for x in jax.tree.leaves(states)
-    ]
-    assert {len(x) for x in arrays} == {3}
-    assert sum(isinstance(x, np.ndarray) for x in arrays) == len(arrays) - 2
-    like = jax.tree.map(lambda x: (x.shape, x.dtype), members.shapes())
-    assert jax.tree.map(lambda x: (x.shape, x.dtype), states) == like
-
-
 def trained(members, advance, states):
     """Return metrics and parameters, (members, ...), after all iterations."""
     metrics = []

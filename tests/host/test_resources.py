@@ -21,16 +21,7 @@ from gasil_jax.host.programs import Program
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
-        pytest.param(
-            *("ppo+bc", {"num_envs": 64, "batch_steps": 8192}),
-            marks=[pytest.mark.compiled_as_for_users, pytest.mark.slow],
-        ),
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
-        pytest.param("ppo+sil", {"sil_minibatch_size": 50_000}, marks=pytest.mark.slow),
-        pytest.param(
-            *("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
-            marks=pytest.mark.slow,
-        ),
         ("ppo", {"hidden_sizes": (1500, 1500)}),
     ],
 )

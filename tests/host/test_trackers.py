@@ -1,7 +1,6 @@
 """Metrics in TensorBoard and Weights & Biases."""
 
 import sys
-import time
 import types
 
 import numpy as np
@@ -69,44 +68,16 @@ def test_a_run_in_tensorboard(tmp_path):
     pytest.importorskip("tensorboardX")
     out = tmp_path / "out"
     more = ("--no-stagger-episodes", "--log", "tensorboard", "--out", str(out))
-    assert run.main([*SMALL, *more]) == 0
+    scored = ("--evaluate-every", "128", "--evaluate-episodes", "2")
+    assert run.main([*SMALL, *scored, *more]) == 0
     (path,) = out.glob("programs/*/tensorboard/*")
     content = path.read_bytes()
     assert content.count(b"mean/policy_loss") == 2
+    # Before training, and after each of the iterations.
+    assert content.count(b"mean/evaluation") == 3
     # Episodes of 50 steps end in the second iteration.
     for name in (b"mean/episode_return", b"episode_return/0-3", b"episode_return/0-4"):
         assert content.count(name) == 1
-
-
-@pytest.mark.slow
-def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
-    pytest.importorskip("wandb")
-    # wandb replaces it, and other tests look at what exits.
-    monkeypatch.setattr(sys, "exit", sys.exit)
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    out = tmp_path / "out"
-    out.mkdir()
-    members = {"3": {"seed": 3}, "4": {"seed": 4}}
-    # A run, and its continuation with more steps.
-    for total_steps, steps in ((256, [128, 256]), (384, [384])):
-        config = {"total_steps": total_steps}
-        (tracker,) = trackers.make(
-            ["wandb"], out, run_name="alpha-2", config=config, members=members
-        )
-        returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
-        metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
-        trackers.log([tracker], metrics)
-        tracker.close()
-        time.sleep(1.1)  # W&B names its folders by the second.
-    identifier = (out / "wandb-id").read_text()
-    for label in members:
-        name = f"run-{identifier}-{label}.wandb"
-        paths = sorted(out.glob(f"wandb/offline-run-*/{name}"))
-        for path, count in zip(paths, (2, 1), strict=True):
-            assert path.read_bytes().count(b"episode_return") >= count
-    # Another run in a folder of the same name is another one there.
-    (tmp_path / "other" / "out").mkdir(parents=True)
-    assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
 
 
 def test_a_program_of_a_sweep_is_told_with_its_own_values(
