@@ -5,12 +5,12 @@ import os
 import pathlib
 import re
 import shlex
-import shutil
 import subprocess
 
 import jax
 import numpy as np
 import pytest
+from small_training import drawn_policies
 
 import gasil_jax
 from gasil_jax.cli import evaluate, options, parsing, plot, render, run, sweep
@@ -273,25 +273,15 @@ def test_the_agents_of_the_table_are_all_that_there_are():
     assert sorted(agents) == sorted(gasil_jax.agents.AGENTS)
 
 
-@pytest.fixture(scope="session")
-def saved_policies(tmp_path_factory):
-    """A file of four policies."""
-    env = gasil_jax.make_env("point_mass")
-    algorithm = gasil_jax.algorithm("ppo", num_envs=1, batch_steps=64)
-    init = jax.vmap(lambda seed: gasil_jax.init(env, algorithm, jax.random.key(seed)))
-    states = jax.jit(init)(np.arange(4, dtype=np.uint32))
-    path = tmp_path_factory.mktemp("policies") / "policy.npz"
-    policy_file.save(path, states, env, range(4), np.zeros(4))
-    return path
-
-
 @pytest.fixture
-def finished_hopper(saved_policies, tmp_path, monkeypatch):
+def finished_hopper(tmp_path, monkeypatch):
     """The folder runs/hopper with policies, in the working directory."""
     monkeypatch.chdir(tmp_path)
     folder = pathlib.Path("runs", "hopper")
     folder.mkdir(parents=True)
-    shutil.copy(saved_policies, folder)
+    env = gasil_jax.make_env("point_mass")
+    states = drawn_policies(env, gasil_jax.algorithm("ppo"), 4)
+    policy_file.save(folder / "policy.npz", states, env, range(4), np.zeros(4))
 
 
 def run_python(path):

@@ -15,7 +15,7 @@ import types
 import jax
 import numpy as np
 import pytest
-from refusals import rows
+from refusals import refused, rows
 from small_training import FLAGS
 
 import gasil_jax
@@ -266,34 +266,29 @@ def test_a_task_without_a_tuned_preset_is_told(words, message, capsys):
     assert len(lines) == bool(message) and all(message in line for line in lines)
 
 
-def test_training_starts_from_another_runs_policy(tmp_path, monkeypatch, capsys):
+def test_training_starts_from_another_runs_policy(
+    trained, tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
-    begin = ("--agent", "ppo", "--seeds", "2", "--out", "first")
-    assert run.main([*FLAGS, *begin]) == 0
-    more = ("--agent", "ppo+sil", "--init-from", "first", "--evaluate-every", "128")
-    keep = ("--keep-checkpoints", "3")
-    assert run.main([*FLAGS, *more, *keep, "--out", "second"]) == 0
-    (stored,) = (path.parent for path in tmp_path.glob("second/**/00000000"))
-    begun = checkpoint.read(stored / "00000000")
-    *_, trained = saved.load(pathlib.Path("first"))
-    best = start.find(pathlib.Path("first")).seed
+    first = str(trained.folder)
+    more = ("--agent", "ppo", "--init-from", first, "--evaluate-every", "128")
+    assert run.main([*FLAGS, *more, "--keep-checkpoints", "3", "--out", "second"]) == 0
+    (stored,) = tmp_path.glob("second/**/00000000")
     *_, last = saved.load(pathlib.Path("second"))
-    first = gasil_jax.member(begun.restore(jax.eval_shape(lambda: last)), 0)
-    expected = gasil_jax.member(trained, best)
+    begun = checkpoint.read(stored).restore(jax.eval_shape(lambda: last))
+    best = start.find(trained.folder).seed
+    *_, expected = saved.load(trained.folder, seed=best)
     for part in (lambda x: x.actor_critic.policy.params, lambda x: x.normalizer):
-        jax.tree.map(np.testing.assert_array_equal, part(first), part(expected))
-    assert int(first.iteration) == 0
+        jax.tree.map(np.testing.assert_array_equal, part(begun), part(expected))
+    assert begun.iteration.tolist() == [0]
     # It is not the run that starts from scratch, and other policies are refused.
     (one,) = sweep_.read(pathlib.Path("second")).runs.values()
     assert one.key != dataclasses.replace(one, start=None).key
-    assert run.main(["--resume", "--out", "first", "--total-steps", "384"]) == 0
     for words, why in (
-        (("--resume", "--out", "second", "--seeds", "2"), "has been trained since"),
-        ((*FLAGS, "--init-from", "first", "--layer-norm"), "has another form: "),
-        ((*FLAGS, "--init-from", "nowhere"), "nowhere, which does not exist"),
+        (("--init-from", first, "--layer-norm"), "has another form: "),
+        (("--init-from", "nowhere"), "nowhere, which does not exist"),
     ):
-        assert run.main([*words]) == 2
-        assert why in capsys.readouterr().err
+        assert why in refused(capsys, run, *FLAGS, *words)
     assert not pathlib.Path("runs").exists()
 
 

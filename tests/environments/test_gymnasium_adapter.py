@@ -163,17 +163,6 @@ def test_a_forked_process_is_refused(make):
     child.join(60)
 
 
-def test_forked_processes_of_gymnasium_are_refused_in_the_parent():
-    forked = {"context": "fork"}
-    with pytest.raises(RuntimeError, match=r'kwargs=\{"context": "spawn"\}'):
-        gymnasium.make_vec(
-            "gasil_envs/point_mass",
-            num_envs=2,
-            vectorization_mode="async",
-            vector_kwargs=forked,
-        )
-
-
 @SINGLE_AND_BATCH
 def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
     env = make()

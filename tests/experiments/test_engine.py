@@ -190,8 +190,8 @@ def test_a_figure_is_trained_from_end_to_end_and_in_shards(toy, tmp_path, capsys
     assert "matrix: 0 runs are missing" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("name", FIGURES)
-def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
+@pytest.mark.parametrize("name", ["matrix", "delayed_rewards", "sparse_causes"])
+def test_the_page_of_a_small_version_can_be_written(name, tmp_path):
     """As if all of its runs were trained already."""
     results = tmp_path / "quick" / "results"
     store, made = Store(results / "runs"), {"physics": "jax", "versions": None}

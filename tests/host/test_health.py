@@ -23,9 +23,9 @@ def as_arrays(tree):
     return [np.asarray(plain(x)) for x in jax.tree.leaves(tree)]
 
 
-def train(agent, change, iterations):
+def train(change, iterations):
     """Train members from changed first states; return their last states and metrics."""
-    members, first, advance = test_members.compiled(agent)
+    members, first, advance = test_members.compiled()
     states = members.to_devices(change(first))
     collected = []
     for i in range(iterations):
@@ -45,7 +45,7 @@ def assert_others_are_equal(states, others_states):
         np.testing.assert_array_equal(left[others], right[others])
 
 
-@pytest.mark.xdist_group("members ppo+gasil")
+@pytest.mark.xdist_group("members")
 def test_a_nan_in_one_environment_of_one_seed():
     def hurt(states):
         environments = states.environments
@@ -58,8 +58,8 @@ def test_a_nan_in_one_environment_of_one_seed():
         state = environments.state.replace(pipeline_state=physics)
         return states.replace(environments=environments.replace(state=state))
 
-    clean, clean_metrics = train("ppo+gasil", lambda states: states, 3)
-    after, metrics = train("ppo+gasil", hurt, 3)
+    clean, clean_metrics = train(lambda states: states, 3)
+    after, metrics = train(hurt, 3)
 
     # One step of the second seed is counted, and its episode is over with it.
     np.testing.assert_array_equal(metrics["faulty_steps"].sum(axis=1), [0, 1, 0])
@@ -74,20 +74,20 @@ def test_a_nan_in_one_environment_of_one_seed():
     assert_others_are_equal(metrics, clean_metrics)
 
 
-@pytest.mark.xdist_group("members ppo+gasil")
+@pytest.mark.xdist_group("members")
 def test_an_update_that_is_not_finite_is_skipped_and_flagged():
     def wild(states):
         numbers = states.hyperparameters
         rate = numbers["learning_rate"].at[1].set(jnp.inf)
         return states.replace(hyperparameters={**numbers, "learning_rate": rate})
 
-    _, first, _ = test_members.compiled("ppo+gasil")
-    after, metrics = train("ppo+gasil", wild, 2)
+    _, first, _ = test_members.compiled()
+    after, metrics = train(wild, 2)
     np.testing.assert_array_equal(metrics["skipped_updates"].sum(axis=1), [0, 2, 0])
     before = as_arrays(first.actor_critic)
     for left, right in zip(as_arrays(after.actor_critic), before, strict=True):
         np.testing.assert_array_equal(left[1], right[1])
-    expected, _ = train("ppo+gasil", lambda states: states, 2)
+    expected, _ = train(lambda states: states, 2)
     assert_others_are_equal(after.actor_critic, expected.actor_critic)
 
 
