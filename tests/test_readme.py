@@ -10,9 +10,10 @@ import subprocess
 import jax
 import numpy as np
 import pytest
-from small_training import drawn_policies
+from small_training import SETTINGS, drawn_policies
 
 import gasil_jax
+from experiments.agents.constant_bonus import PPOBonus
 from gasil_jax.cli import evaluate, options, parsing, plot, render, run, sweep
 from gasil_jax.host import environments, policy_file, saved
 from gasil_jax.host.sweep import parse_shard
@@ -289,12 +290,16 @@ def run_python(path):
     blocks = re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
     assert blocks
     env = gasil_jax.make_env("point_mass")
-    small = {"batch_steps": 512, "num_envs": 4, "num_epochs": 1}
-    small |= {"hidden_sizes": (8,)}
+
+    def small(algorithm):
+        """A smaller algorithm; of agents with an alpha this one compiles soonest."""
+        small = gasil_jax.Algorithm(PPOBonus(), config=algorithm.config)
+        return small.replace(**SETTINGS | {"batch_steps": 512, "total_steps": 1024})
+
     names = {"observation": np.zeros(env.observation_size, np.float32), "small": small}
     changes = {
         r'"(walker2d|hopper)", ': '"point_mass", ',
-        r"(gasil_jax\.preset\(.*\))": r"\1.replace(**small, total_steps=1024)",
+        r"(gasil_jax\.preset\(.*\))": r"small(\1)",
         "1_000_000": "1024",
         r"key\(0\), \d+\)": "key(0), 2)",
         r"n_trials=\d+": "n_trials=2",

@@ -1,13 +1,10 @@
 """The site that MkDocs builds of the documentation needs nothing but itself."""
 
-import json
 import os
 import pathlib
 import re
-import runpy
 import subprocess
 import sys
-import types
 import urllib.parse
 from html.parser import HTMLParser
 
@@ -76,6 +73,8 @@ def target(site, path, link):
 
 
 def test_all_that_is_public_is_there(site):
+    notebook = (site / "examples" / "point_mass" / "index.html").read_text()
+    assert "output of the code above" in notebook
     assert "make_train" in (site / "api" / "index.html").read_text()
     assert 'id="gasil_jax.train.make_train"' in (
         (site / "api" / "gasil_jax.train" / "index.html").read_text()
@@ -140,38 +139,3 @@ def test_every_page_and_picture_can_be_reached(site, pages):
     assert {path.name for path in pictures} <= {path.name for path in shown}
     # The home page shows a film and a figure.
     assert len(pages[home].images) >= 2
-
-
-def test_notebooks_and_modules_have_pages(tmp_path, monkeypatch):
-    """A notebook's shows what it printed and drew."""
-    hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
-    picture = {"data": {"image/png": "iVBORw0KGgo="}}
-    code = {"cell_type": "code", "source": ["1 + 1"]}
-    code["outputs"] = [{"text": ["2\n", "3\n"]}, picture]
-    cells = [{"cell_type": "markdown", "source": ["# Title"]}, code]
-    (tmp_path / "examples").mkdir()
-    (tmp_path / "examples" / "x.ipynb").write_text(json.dumps({"cells": cells}))
-    module = "::: a.b\n    options:\n      members: [c]\n"
-    (tmp_path / "api.md").write_text(f"# API\n\n{module}\n::: d\n")
-    made = {}
-    monkeypatch.setattr(
-        hooks["File"],
-        "generated",
-        lambda config, uri, content: made.setdefault(uri, content),
-    )
-    hooks["on_files"]([], types.SimpleNamespace(docs_dir=str(tmp_path)))
-    shown = "```text\n2\n3\n```\n\n![output of the code above](x-3.png)"
-    assert made["examples/x.md"] == f"# Title\n\n```python\n1 + 1\n```\n\n{shown}"
-    assert made["examples/x-3.png"].startswith(b"\x89PNG")
-    assert made["api/a.b.md"] == f"# a.b\n\n{module}"
-    assert made["api/d.md"] == "# d\n\n::: d\n"
-
-
-def test_a_formula_that_is_not_known_is_told(caplog):
-    hooks = runpy.run_path(str(DOCS / "site_hooks.py"))
-    page = types.SimpleNamespace(url="algorithm/")
-    for tex, known in ((r"-\log D(s)", True), (r"\unheard D", False)):
-        content = rf'<span class="arithmatex">\({tex}\)</span>'
-        assert hooks["on_page_content"](content, page).startswith("<math")
-        assert (caplog.text == "") is known
-    assert r"algorithm/: a formula that is not known" in caplog.text

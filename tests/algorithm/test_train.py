@@ -10,7 +10,6 @@ import pytest
 import gasil_jax
 from gasil_envs.gymnax_adapter import GymnaxEnv
 from gasil_jax import learner, rollout
-from gasil_jax.context import merge_metrics
 from gasil_jax.distributions import GAUSSIAN
 
 CONFIG = gasil_jax.Config(
@@ -123,11 +122,3 @@ def test_an_update_that_is_not_finite_is_as_if_it_had_not_been():
     # An agent of the user's may return Python's own numbers.
     healthy, kept = learner.keep_if_finite({"loss": 2.0}, {"loss": jnp.float32(1)})
     assert healthy and kept["loss"] == 2.0
-
-
-def test_metrics_of_one_name_are_refused():
-    merged = merge_metrics("ppo", {"a": jnp.int32(1)}, {"b": jnp.float32(2)})
-    assert merged == {"a": 1.0, "b": 2.0}
-    assert all(value.dtype == jnp.float32 for value in merged.values())
-    with pytest.raises(ValueError, match="metric 'a' of ppo has the name of another"):
-        merge_metrics("ppo", {"a": jnp.int32(1)}, {"a": jnp.float32(2)})

@@ -20,7 +20,6 @@ from experiments.store import Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
 from gasil_jax.host.evaluations import evaluation_key
-from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.host.runs import Run
 
@@ -134,30 +133,6 @@ def beside(waiting):
     finally:
         ended.set()
         thread.join()
-
-
-def test_interrupted_training_is_continued_on_request_only(tmp_path):
-    store, setup = Store(tmp_path / "store"), Setup(tmp_path / "runs")
-    runs = [run(total_steps=10**9)]
-
-    def size():
-        return sum(
-            path.stat().st_size for path in tmp_path.glob("runs/*/*/metrics.csv")
-        )
-
-    def interrupt(before):
-        while size() <= before:
-            yield
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    for resume in (False, True):
-        with beside(interrupt(size())), pytest.raises(Interrupted) as interrupted:
-            engine.train_missing(runs, store, dataclasses.replace(setup, resume=resume))
-        assert "--resume" in interrupted.value.__notes__[0]
-        assert list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))
-    with pytest.raises(InputError, match="--resume"):
-        engine.train_missing(runs, store, setup)
-    assert store.missing(runs) == runs
 
 
 @pytest.fixture

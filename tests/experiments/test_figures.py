@@ -9,7 +9,7 @@ import gasil_jax
 from experiments import search
 from experiments.curves import Arm, Curve, Figure, grid
 from experiments.figures import FIGURES
-from experiments.search import DELAY, PAIR, Search
+from experiments.search import DELAY, Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax.algorithms import check
 
@@ -65,20 +65,6 @@ def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
 
 
 SHARED = {"num_envs": 64, "normalize_rewards": True}
-DELAYS = Figure(
-    "Delays",
-    "",
-    grid(
-        ("hopper", "swimmer"),
-        PAIR,
-        (1, 5, 20, 1000),
-        panel="{env}",
-        curve="{arm}-{delay}",
-        base=None,
-        changes=SHARED,
-    ),
-    over=("reward_delay", "delay"),
-)
 
 
 def test_an_ablation_is_a_row():
@@ -98,14 +84,3 @@ def test_an_ablation_is_a_row():
         assert runs[0].algorithm == expected
     others = [key[1:] for key in figure.compared() if key[0] == "ant-delayed"]
     assert others == [("ppo+gasil", "ppo"), ("ppo+gasil", "weak")]
-
-
-def test_a_figure_over_delays_is_a_row():
-    assert list(DELAYS.panels) == ["hopper", "swimmer"]
-    for _, name, curve in DELAYS.curves():
-        (run, *_) = curve.runs(STORE)
-        assert name == f"{run.algorithm.agent.name}-{run.settings.reward_delay}"
-        assert run.algorithm.config.num_envs == 64
-    # Agents are compared where the delay is the same.
-    others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
-    assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]

@@ -370,19 +370,6 @@ class Bomb:
         return (exec, ("import builtins; builtins.exploded = True",))
 
 
-POLICY = {
-    "seeds": np.arange(2),
-    "final_return": np.array([1.0, np.nan]),
-    "mean": np.zeros((2, 3), np.float32),
-    "scale": np.ones((2, 3), np.float32),
-    "log_std": np.zeros((2, 1), np.float32),
-    "low": np.full(1, -1, np.float32),
-    "high": np.ones(1, np.float32),
-    "kernel_0": np.ones((2, 3, 4), np.float32),
-    "bias_0": np.zeros((2, 4), np.float32),
-    "kernel_1": np.ones((2, 4, 1), np.float32),
-    "bias_1": np.zeros((2, 1), np.float32),
-}
 EXPERT = {"observation": np.ones((5, 3)), "action": np.zeros((5, 1))}
 ODD = [
     *(np.zeros((5, 1), complex), np.full((5, 1), b"1"), np.zeros((5, 1), "m8[s]")),
@@ -419,18 +406,10 @@ def test_a_foreign_archive_is_refused_and_never_unpickled(content, tmp_path):
     assert not hasattr(builtins, "exploded")
 
 
-@pytest.mark.parametrize("name", ["seeds", "final_return", "mean", "scale", "kernel_0"])
+@pytest.mark.parametrize("name", ["seeds", "mean", "kernel_0"])
 def test_a_file_of_policies_without_one_of_its_arrays_is_refused(name, tmp_path):
-    np.savez(tmp_path / "policy.npz", **{x: y for x, y in POLICY.items() if x != name})
+    arrays = dict(np.load(numpy_policy.ZOO / "hopper.npz"))
+    del arrays[name]
+    np.savez(tmp_path / "policy.npz", **arrays)
     with pytest.raises(ValueError, match=rf"is not a saved policy \({name} is missing"):
         gasil_jax.load_policy(tmp_path)
-
-
-def test_a_policy_of_another_byte_order_acts(tmp_path):
-    swapped = {name: x.astype(x.dtype.newbyteorder()) for name, x in POLICY.items()}
-    np.savez(tmp_path / "policy.npz", **swapped)
-    np.savez(tmp_path / "plain.npz", **POLICY)
-    observation = np.ones(3, np.float32)
-    expected = gasil_jax.load_policy(tmp_path / "plain.npz")(observation)
-    assert gasil_jax.load_policy(tmp_path)(observation) == expected
-    assert numpy_policy.load(tmp_path)(observation) == expected
