@@ -144,28 +144,6 @@ def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_pai
     assert begin_before > 5
 
 
-def test_a_window_is_given_what_it_paid():
-    """A window within a batch; one that began before lacks its share of that."""
-    batches = list(random_batches(1, 6))
-    assert sum(batch.faulty.sum() for batch in batches) > 0
-    begins_here = np.ones(NUM_ENVS, bool)
-    for batch, (_, _, reward, _) in zip(batches, decompose_all(batches), strict=True):
-        for env in range(NUM_ENVS):
-            running = []
-            for t in range(NUM_STEPS):
-                running.append(reward[t, env])
-                paid = batch.reward[t, env]
-                if paid == 0 and not batch.ended[t, env]:
-                    continue
-                if begins_here[env] and not batch.faulty[t, env]:
-                    np.testing.assert_allclose(sum(running), paid, rtol=1e-4, atol=1e-5)
-                    if len(running) == 1:
-                        assert reward[t, env] == paid
-                begins_here[env], running = True, []
-            begins_here[env] = not running
-        np.testing.assert_array_equal(reward[batch.faulty], 0.0)
-
-
 def test_a_failed_update_leaves_the_network_and_nothing_else():
     batches = list(random_batches(2, 5))
     usual = list(decompose_all(batches))

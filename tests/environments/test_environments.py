@@ -80,9 +80,9 @@ def test_one_step_equals_gymnasiums(name, physics):
     if physics == "jax" and name in ("humanoidstandup", "pusher"):
         pytest.skip("the one has humanoid's model, the other MJX's own step")
     env, reset, step = env_and_functions(name, physics)
-    # Here, and not in a test of its own, so that a step is compiled once. A reset is
-    # the same for all tasks, so MJX's, slow to compile, is compiled for one.
-    if physics == "mujoco" or name == "hopper":
+    # Here, and not in a test of its own, so that a step is compiled once. Resets with
+    # our own physics, slow to compile, are those of test_mazes.py.
+    if physics == "mujoco":
         check_reset_and_step(env, reset, step)
     transitions = gymnasium_transitions(name)
     *before, action = (jnp.asarray(x, jnp.float32) for x in transitions[:5])

@@ -5,11 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-import gasil_jax
 from experiments import search
-from experiments.curves import Arm, Curve, Figure, grid
+from experiments.curves import Curve
 from experiments.figures import FIGURES
-from experiments.search import DELAY, Search
+from experiments.search import Search
 from experiments.store import RESULTS, Record, Store
 from gasil_jax.algorithms import check
 
@@ -62,25 +61,3 @@ def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
     assert scheduled.replace(alpha=0.2, alpha_schedule=()) == fixed
     bare = dataclasses.replace(curves["ppo"], base="tuned", changes={})
     assert isinstance(bare, Curve) and bare.point(STORE) == {}
-
-
-SHARED = {"num_envs": 64, "normalize_rewards": True}
-
-
-def test_an_ablation_is_a_row():
-    weak = Arm("weak", "ppo+gasil", {"alpha": 0.01, "num_envs": 8})
-    arms = ("ppo", weak, "ppo+gasil")
-    panels = grid(("hopper", "ant"), arms, (DELAY,), base=None, changes=SHARED, seeds=5)
-    figure = Figure("Ablation", "", panels, favourite="ppo+gasil")
-    assert list(figure.panels) == ["hopper-delayed", "ant-delayed"]
-    for _, name, curve in figure.curves():
-        runs = curve.runs(STORE)
-        assert [run.seed for run in runs] == [0, 1, 2, 3, 4]
-        assert {run.settings.reward_delay for run in runs} == {DELAY}
-        agent = "ppo" if name == "ppo" else "ppo+gasil"
-        expected = gasil_jax.algorithm(agent, total_steps=1_000_000, **SHARED)
-        if name == "weak":
-            expected = expected.replace(alpha=0.01, num_envs=8)
-        assert runs[0].algorithm == expected
-    others = [key[1:] for key in figure.compared() if key[0] == "ant-delayed"]
-    assert others == [("ppo+gasil", "ppo"), ("ppo+gasil", "weak")]

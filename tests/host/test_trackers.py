@@ -117,10 +117,9 @@ def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, ca
     mode, printed = started()
     assert mode == "offline" and "no API key" in printed
     assert len(printed.splitlines()) == 1
-    for name, value in (("WANDB_API_KEY", "key"), ("WANDB_MODE", "online")):
-        with monkeypatch.context() as patch:
-            patch.setenv(name, value)
-            assert started() == (None, "")
+    with monkeypatch.context() as patch:
+        patch.setenv("WANDB_API_KEY", "key")
+        assert started() == (None, "")
     login = "machine api.wandb.ai\n  login user\n  password key\n"
     (tmp_path / ".netrc").write_text(login)
     assert started() == (None, "")
