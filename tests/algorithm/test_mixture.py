@@ -7,17 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_training import SETTINGS, drawn_policies
+from test_distributions import softmax
 
 import gasil_jax
 from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
 from gasil_jax.host import policy_file
 from gasil_jax.networks import MixturePolicy
-
-
-def softmax(logits):
-    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return exponentials / exponentials.sum(axis=-1, keepdims=True)
 
 
 def draw(seed=0, batch=5, components=4, size=3, spread=1.0):

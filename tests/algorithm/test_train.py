@@ -9,8 +9,7 @@ import pytest
 
 import gasil_jax
 from gasil_envs.gymnax_adapter import GymnaxEnv
-from gasil_jax import learner, rollout
-from gasil_jax.distributions import GAUSSIAN
+from gasil_jax import learner
 
 CONFIG = gasil_jax.Config(
     total_steps=512,
@@ -49,26 +48,6 @@ def test_it_trains_an_environment_of_brax():
     # No episode ends by itself, and none is longer than the limit.
     assert set(np.asarray(metrics["episode_length"])) == {50.0}
     assert int(state.agent.buffer.size) > 0
-
-
-@pytest.mark.parametrize("limit", [50, 30, 1])
-def test_a_limit_of_the_run_loses_no_delayed_reward(limit):
-    env = gasil_jax.make_env("point_mass", reward_delay=20)
-    collect = lambda key: rollout.collect(
-        env,
-        lambda observation: (jnp.zeros((4, 2)), jnp.zeros(2)),
-        rollout.init(env, key, 4),
-        key,
-        distribution=GAUSSIAN,
-        num_steps=limit,
-        max_episode_steps=limit,
-        gamma=1.0,
-    )[1]
-    batch = jax.jit(collect)(jax.random.key(0))
-    assert batch.truncated[-1].all() and not batch.ended[:-1].any()
-    earned = batch.episode_return[-1]
-    np.testing.assert_allclose(batch.discounted_return[-1], earned, rtol=1e-5)
-    np.testing.assert_allclose(batch.reward.sum(axis=0), earned, rtol=1e-5)
 
 
 def test_a_state_may_begin_outside_of_jit_and_be_donated():

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs import Wrapper
 from refusals import refused
 from small_training import drawn_policies
 
@@ -102,24 +101,3 @@ def test_scores_are_those_of_a_plain_loop(untrained):
         assert int(scored["episode_length"][i]) == length == 50
     drawn = scores(*untrained, deterministic=False)
     assert not np.allclose(drawn["episode_return"], scored["episode_return"])
-
-
-def test_an_episode_that_is_only_cut_off_ends_too(untrained):
-    """As in training; `done` need not be set beside `truncation`."""
-    env, algorithm, state = untrained
-
-    class CutOff(Wrapper):
-        def reset(self, rng):
-            state = self.env.reset(rng)
-            info = {"time": jnp.int32(0), "truncation": jnp.float32(0)}
-            return state.replace(info={**state.info, **info})
-
-        def step(self, state, action):
-            time = state.info["time"] + 1
-            stepped = self.env.step(state, action)
-            cut_off = jnp.where(time == 7, 1.0, 0.0)
-            info = {**stepped.info, "time": time, "truncation": cut_off}
-            return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
-
-    lengths = scores(CutOff(env), algorithm, state)["episode_length"]
-    assert lengths.tolist() == [7, 7, 7]

@@ -200,10 +200,6 @@ def test_of_two_curves_below_doing_nothing_neither_is_better(tmp_path, monkeypat
     ("verdicts", "words"),
     [
         ([], "not measured"),
-        (
-            ["worse"],
-            "**open**: 0 of 1; the opposite in 1 of 1 comparisons; 2 not measured",
-        ),
         (["better", "better"], "**holds**: 2 of 2 (0, 1); 1 not measured"),
         (["not clear"] * 2, "**does not hold**: 0 of 2; 1 not measured"),
         (

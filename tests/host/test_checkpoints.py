@@ -114,12 +114,14 @@ def test_a_damaged_checkpoint_is_told_and_the_one_before_is_used(damage, tmp_pat
     with pytest.raises(ValueError, match="00000002 is damaged"):
         checkpoint.best(tmp_path)
     assert checkpoint.best_score(tmp_path) >= 1.0
-    # Set aside it counts no more, and written again it is whole.
-    checkpoint.set_aside(tmp_path, newer_than=1)
-    assert names(tmp_path) == ["00000000", "00000001", "00000002.damaged"]
+    # Written again, it is whole.
     write(tmp_path, 2, None, states[2])
     assert checkpoint.latest(tmp_path)[0].iteration == 2
     assert checkpoint.best(tmp_path).iteration == 1
+    # Set aside, it counts no more.
+    checkpoint.set_aside(tmp_path, newer_than=1)
+    assert names(tmp_path) == ["00000000", "00000001", "00000002.damaged"]
+    assert checkpoint.latest(tmp_path)[0].iteration == 1
 
 
 def test_the_best_and_the_newest_are_kept(tmp_path):
