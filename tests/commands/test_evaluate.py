@@ -1,6 +1,5 @@
 """Saving, loading and scoring a run's policies."""
 
-import csv
 import shutil
 
 import jax
@@ -8,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import refused
-from small_training import drawn_policies
+from small_training import drawn_policies, table
 
 import gasil_jax
 from gasil_jax import evaluate, evaluation, numpy_policy, policy
@@ -29,8 +28,7 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(
     assert header.split()[0] == "seed" and where == f"in {out}"
     assert over_seeds.startswith("return ")
     assert over_seeds.endswith("(interquartile mean over 3 seeds)")
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = table(out)
     assert [(row["seed"], row["episode"]) for row in rows] == [
         (seed, episode) for seed in "567" for episode in "012"
     ]

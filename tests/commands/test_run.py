@@ -1,6 +1,5 @@
 """The command line: a run from end to end, and refusals before anything compiles."""
 
-import csv
 import dataclasses
 import json
 import math
@@ -16,7 +15,7 @@ import jax
 import numpy as np
 import pytest
 from refusals import refused, rows
-from small_training import FLAGS
+from small_training import FLAGS, table
 
 import gasil_jax
 from gasil_envs import user_code
@@ -79,11 +78,6 @@ def test_the_environments_are_listed(capsys):
     assert names[0] == "point_mass"
     assert {"walker2d", "brax:ant", "sparse:u_maze"} < set(names)
     assert len(names) == len(set(names)) and all(len(x.split()) == 1 for x in names)
-
-
-def table(path):
-    with path.open() as file:
-        return list(csv.DictReader(file))
 
 
 def test_a_run_from_end_to_end(trained):

@@ -1,6 +1,5 @@
 """Sweeps run, grow or are refused; a point's results are those of a single run."""
 
-import csv
 import json
 import os
 import pathlib
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 import pytest
 from refusals import refused, rows
-from small_training import FLAGS
+from small_training import FLAGS, table
 
 import gasil_jax
 from gasil_jax import plot, run, sweep
@@ -83,11 +82,6 @@ def test_points_from_a_file(tmp_path):
             points_of("--points-file", str(path))
 
 
-def table(folder):
-    with (folder / "results.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_sweep_from_end_to_end(swept):
     out, told, printed = swept
     assert "x 8 runs" in told
@@ -103,7 +97,7 @@ def test_a_sweep_from_end_to_end(swept):
     commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out; "
     assert following.startswith(f"next: {commands}python -m gasil_jax.render out ")
 
-    rows = table(out)
+    rows = table(out / "results.csv")
     assert [(row["point"], row["seed"]) for row in rows] == [
         (str(point), seed) for point in range(4) for seed in "56"
     ]
@@ -257,7 +251,7 @@ def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
     agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
     own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")
     assert run.main([*FLAGS, *agents, *own, "--out", "out"]) == 0
-    rows = list(csv.DictReader(pathlib.Path("out/results.csv").open()))
+    rows = table("out/results.csv")
     assert [row["agent"] for row in rows] == ["ppo", "ppo+sil"]
     stored = read_sweep(pathlib.Path("out"))
     # Each has its own preset, and of what is given what it has.

@@ -1,6 +1,5 @@
 """Policies are evaluated during training."""
 
-import csv
 import json
 import os
 import shutil
@@ -8,7 +7,7 @@ import signal
 
 import numpy as np
 import pytest
-from small_training import FLAGS
+from small_training import FLAGS, table
 from test_resume import program_of
 
 import gasil_jax
@@ -40,8 +39,7 @@ def evaluated(tmp_path_factory):
 
 
 def rows(out):
-    with (program_of(out) / "evaluations.csv").open() as file:
-        return list(csv.DictReader(file))
+    return table(program_of(out) / "evaluations.csv")
 
 
 def assert_same_tables(first, second):
@@ -62,24 +60,24 @@ def means(out):
 def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
     evaluated,
 ):
-    table = rows(evaluated)
+    scores = rows(evaluated)
     names = ["point", "seed", "env_steps", "mean", "min", "max", "length"]
-    assert list(table[0]) == names
-    assert [(int(row["env_steps"]), int(row["seed"])) for row in table] == [
+    assert list(scores[0]) == names
+    assert [(int(row["env_steps"]), int(row["seed"])) for row in scores] == [
         (iteration * 128, seed)
         for iteration in (0, 5, 10, 15, 20, 22)
         for seed in SEEDS
     ]
-    for row in table:
+    for row in scores:
         low, mean, high = (float(row[name]) for name in ("min", "mean", "max"))
         assert low <= mean <= high and row["length"] == "50"
     summary = json.loads((evaluated / "summary.json").read_text())
     (point,) = summary["points"]
-    last = [float(row["mean"]) for row in table[-3:]]
+    last = [float(row["mean"]) for row in scores[-3:]]
     assert point["final_evaluation"] == pytest.approx(np.mean(last))
     assert point["final_length"] == 50.0
-    with (evaluated / "results.csv").open() as file:
-        written = [float(row["final_evaluation"]) for row in csv.DictReader(file)]
+    results = table(evaluated / "results.csv")
+    written = [float(row["final_evaluation"]) for row in results]
     assert written == pytest.approx(last)
     assert summary["evaluation_seconds"] > 0
 

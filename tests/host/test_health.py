@@ -1,6 +1,5 @@
 """Numbers that are not finite affect one step or update of one member alone."""
 
-import csv
 import json
 
 import jax
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 import test_members
 from brax.envs import State
-from small_training import DISCRIMINATOR, FLAGS, SETTINGS
+from small_training import DISCRIMINATOR, FLAGS, SETTINGS, table
 
 import gasil_jax
 from gasil_envs import wrappers
@@ -101,8 +100,8 @@ def test_an_unhealthy_seed_is_in_the_results_with_a_warning(tmp_path, capsys):
     assert told.count("warning: an update was undone because a number in it") == 1
     (point,) = json.loads((out / "summary.json").read_text())["points"]
     assert point["diverged_seeds"] == 2
-    with (out / "results.csv").open() as file:
-        assert [row["skipped_updates"] for row in csv.DictReader(file)] == ["2", "2"]
+    skipped = [row["skipped_updates"] for row in table(out / "results.csv")]
+    assert skipped == ["2", "2"]
 
 
 class Fragile:
