@@ -100,7 +100,8 @@ figure report --help-me | unrecognized arguments: --help-me
 figure benchmark --tables speed | --tables: invalid choice: 'speed' (ch
 figure benchmark --repeats 9 --page | page is set, but
 evaluate | RUN is missing: see --help
-evaluate zoo:nothing | nothing
+evaluate zoo:walker --gymnasium | policy of the zoo 'walker' is unknown: did
+evaluate zoo:swimmer-delayed --point 1 | it has no points and no checkpoints
 plot | runs is empty: name one folder or more
 """
 #: The same of folders in which there is a run or a sweep.

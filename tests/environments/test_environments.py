@@ -196,23 +196,6 @@ def test_point_mass_against_a_plain_python_twin():
     assert collected >= 3
 
 
-@pytest.mark.parametrize("kind", [int, np.int64, np.uint8])
-def test_whole_numbers_of_every_kind_are_taken(kind):
-    env = gasil_envs.make(
-        "point_mass", reward_delay=kind(3), max_episode_steps=kind(7), obs_noise=0.5
-    )
-
-    def one(state, _):
-        state = env.step(state, jnp.zeros(2))
-        return state, (state.reward, state.info["true_reward"], state.done)
-
-    start = env.reset(jax.random.key(0))
-    _, (given, true, done) = jax.lax.scan(one, start, length=7)
-    np.testing.assert_array_equal(done, [0, 0, 0, 0, 0, 0, 1])
-    sums = [true[:3].sum(), true[3:6].sum(), true[6]]
-    np.testing.assert_allclose(given, [0, 0, sums[0], 0, 0, sums[1], sums[2]])
-
-
 _OWN = """
 import jax.numpy as jnp
 from brax.envs import Env, State

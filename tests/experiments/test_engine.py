@@ -215,3 +215,12 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
     assert not list(tmp_path.glob("runs/*/*/training.json"))
     assert __main__.main([*command, "--resume", "--processes", "2"]) == 0
     assert "Not trained yet" not in (tmp_path / "matrix.md").read_text()
+
+
+def test_programs_have_at_most_so_many_members_and_searches_are_not_evaluated():
+    runs = [run(seed) for seed in range(5)] + [run(seed) for seed in (1000, 1001)]
+    every = engine.unfinished(runs, Setup(members=2))
+    assert sorted(len(program.runs) for program in every) == [1, 2, 2, 2]
+    assert {x for program in every for x in program.runs} == set(runs)
+    for program in every:
+        assert len({run.seed >= 1000 for run in program.runs}) == 1

@@ -167,6 +167,7 @@ def test_numbers_of_any_library_are_taken():
         algorithms.check(SMALL.replace(gamma=value, alpha=value))
     for value in (4, np.int64(4), np.uint8(4)):
         algorithms.check(SMALL.replace(num_envs=value))
+        gasil_jax.make_env("point_mass", reward_delay=value, obs_noise=value)
     check = lambda gamma: algorithms.check(SMALL.replace(gamma=gamma)) or gamma
     jax.eval_shape(check, -1.0)  # Traced values pass unlooked at.
 
