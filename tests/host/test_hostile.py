@@ -251,6 +251,11 @@ make_env("sparse:key_grid", action_noise=1.5) | 1.5: .* at most 1, a share, for 
 make_env("point_mass", reward_dellay=2) | 'reward_dellay' .* mean 'reward_delay'
 make_env("point_mass", observe_phase=True) | observe_phase is True: it needs a reward_d
 make_env("Hopper-v5") | did you mean 'hopper'
+gasil_jax.fit(ENV, SMALL, checkpoint_every=64) | is 64: it needs a folder
+gasil_jax.fit(ENV, SMALL, resume=True) | resume is True: it needs a folder
+gasil_jax.fit(ENV, SMALL, folder="/") | folder is .* not empty
+gasil_jax.fit(ENV, SMALL, points=[{"imitation_weight": 1.0}]) | of ppo.gasil-adaptive, n
+gasil_jax.fit(ENV, SMALL, points=[{"num_epochs": 2}]) | num_epochs is not traced
 episodes(3) | act is 3: it must be a function of observations and a key
 episodes(lambda seen, key: None) | act returns None: it must be of shape \(3, 2
 episodes(lambda seen, key: jnp.zeros(2)) | returns an array of shape \(2,\): it

@@ -18,11 +18,18 @@ from gasil_jax.host.members import make_members
 from gasil_jax.host.programs import Program
 
 
+def slow(*case):
+    return pytest.param(*case, marks=pytest.mark.slow)
+
+
 @pytest.mark.parametrize(
     ("agent", "changes"),
     [
         ("ppo+sil", {"sil_buffer_steps": 50_000}),
         ("ppo", {"hidden_sizes": (1500, 1500)}),
+        slow("ppo+bc", {"num_envs": 64, "batch_steps": 8192}),
+        slow("ppo+sil", {"sil_minibatch_size": 50_000}),
+        slow("ppo+gasil", {"discriminator_minibatch_size": 50_000}),
     ],
 )
 def test_the_estimate_is_within_a_factor_of_two(agent, changes):

@@ -38,13 +38,11 @@ SMALL = (
 OFTEN = ("--checkpoint-every", str(20 * 128))
 
 
-def start(out, *arguments, cache=None):
-    """Start a run, which may have a user's own cache of compiled programs."""
-    mine = dict(os.environ)
-    if cache is not None:
-        for tests_own in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
-            mine.pop(tests_own)
-        mine["XDG_CACHE_HOME"] = str(cache)
+def start(out, *arguments, cache):
+    """Start a run with a user's own cache of compiled programs."""
+    mine = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    for of_tests in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
+        del mine[of_tests]
     return subprocess.Popen(
         [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
         env=mine,
