@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gasil_jax import buffer as good_trajectories
+from gasil_jax import rollout
 
 CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
 
@@ -44,7 +45,7 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
         faulty=False,
         cut_short=False,
     )
-    history = good_trajectories.record(history, batch)
+    history = rollout.record(history, batch)
     buffer = good_trajectories.insert(
         buffer, history, ended, return_, length=length, max_episodes=max_episodes
     )
@@ -54,7 +55,7 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
 def empty():
     return (
         good_trajectories.init_buffer(CAPACITY, 1, 1),
-        good_trajectories.init_history(
+        rollout.init_history(
             NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=1, action_size=1
         ),
     )

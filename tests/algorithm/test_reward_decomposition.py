@@ -7,8 +7,7 @@ import pytest
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax import buffer as good_trajectories
-from gasil_jax import normalization
+from gasil_jax import normalization, rollout
 from gasil_jax.context import Context, Sizes
 from gasil_jax.distributions import GAUSSIAN
 from gasil_jax.rewards import decomposition
@@ -35,7 +34,7 @@ def windows_of(history):
 
 def new_history(num_envs=NUM_ENVS, **more):
     sizes = {"observation_size": OBS, "action_size": ACT, "keep_next": True}
-    return good_trajectories.init_history(num_envs, NUM_STEPS, LIMIT, **sizes, **more)
+    return rollout.init_history(num_envs, NUM_STEPS, LIMIT, **sizes, **more)
 
 
 def random_batches(seed, num_batches, delay=5):
@@ -78,7 +77,7 @@ def random_batches(seed, num_batches, delay=5):
 
 @jax.jit
 def decompose_once(state, history, batch, key, learning_rate):
-    history = good_trajectories.record(history, batch)
+    history = rollout.record(history, batch)
     context = Context(
         rollout=batch,
         history=history,

@@ -248,6 +248,7 @@ brax:ant | nothing for agent 'ppo+gasil' on brax:ant with dense rewards
 gymnax:CartPole-v1 --preset gymnax |
 walker2d --agent ppo+bc --preset paper |
 walker2d --agent ppo --reward-delay 20 |
+sparse:u_maze --agent ppo+gasil+novelty |
 """
 
 

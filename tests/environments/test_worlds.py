@@ -11,7 +11,7 @@ from environment_contract import check_reset_and_step
 
 import gasil_envs
 from gasil_envs import pictures, worlds, wrappers
-from gasil_jax.cli import render
+from gasil_jax.host import video
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
@@ -213,7 +213,7 @@ def test_worlds_are_drawn(name):
     assert not pictures.can_draw(gasil_envs.make("gymnax:CartPole-v1"))
     states = [jax.jit(env.reset)(jax.random.key(0))]
     states.append(jax.jit(env.step)(states[0], jnp.int32(1)))
-    frames, _ = render.frames_of(env, [x.pipeline_state for x in states], (160, 120))
+    frames, _ = video.frames_of(env, [x.pipeline_state for x in states], (160, 120))
     assert frames[0].shape == (120, 160, 3) and (frames[0] != frames[1]).any()
     assert len(np.unique(frames[0].reshape(-1, 3), axis=0)) > 1
 

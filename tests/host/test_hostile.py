@@ -80,6 +80,7 @@ SETTINGS = {
     "learning_rate_schedule": [((1, 0.5), (0, 1)), ((0, -1),), lambda: 1.0],
     "normalize_rewards": [None, 1, "on", np.True_],
     "minibatch_size": [60],
+    "bonus": NUMBERS,
 }
 ENVIRONMENT = {
     "reward_delay": [*NUMBERS, 0, 0.5],
@@ -232,8 +233,8 @@ make_train(Corridor(), policy_components=4) | is 4: it must be 1, .* are discret
 make_train(ENV, OwnPolicy(), policy_components=4) | has a policy_network of its own
 make_train(ENV, gasil_jax.GASIL(), bonus="softmax") | bonus 'softmax' is unk.*softplus
 taught(ENV, observation=np.ones((9, 3)), action=np.ones((9, 2))) | of size 3 and actions
-taught(Corridor(), observation=np.eye(4), action=[0, 3, 0, 0]) | from 0 to 3: .* to 2
-taught(ENV, observation=np.ones((2, 11)), action=[0, 1]) | numbers as actions: .* size 2
+taught(Corridor(), observation=np.eye(4), action=[0, 3, 0, 0]) | 0 to 3 as actions: .* to
+taught(ENV, observation=np.ones((2, 11)), action=[0, 1]) | as actions: .* vectors of
 SMALL.replace(expert="a.npz") | expert is a setting of gail, not of ppo
 SMALL.replace(reward_clip=1.0) | reward_clip has no effect: normalize_rewards is off
 SMALL.replace(alhpa=0.1) | 'alhpa' is unknown: did you mean 'alpha'
