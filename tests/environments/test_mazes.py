@@ -195,22 +195,3 @@ def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
     # A random one of four moves, the one that was asked for among them.
     down = moves("key_grid", 0.4, jnp.int32(1))[:, 0] == 1
     assert np.mean(down) == pytest.approx(0.7, abs=0.05)
-
-
-@pytest.mark.parametrize(("name", "noise"), [("u_maze", 0.5), ("key_grid", 0.1)])
-def test_a_noisy_task_is_the_task_with_noise_on_its_actions(name, noise):
-    envs = [
-        gasil_envs.make(f"sparse:{name}", action_noise=noise),
-        gasil_envs.make(f"sparse:{name}_noisy"),
-        gasil_envs.make(f"sparse:{name}"),
-    ]
-
-    def walk(env):
-        zero = wrappers.zero_action(env)
-        start = env.reset(jax.random.key(0))
-        step = lambda state, _: (env.step(state, zero), state.pipeline_state.position)
-        return jax.jit(lambda x: jax.lax.scan(step, x, length=40)[1])(start)
-
-    given, noisy, calm = map(walk, envs)
-    np.testing.assert_array_equal(given, noisy)
-    assert (np.array(given) != calm).any()

@@ -233,7 +233,7 @@ make_train(Corridor(), policy_components=4) | is 4: it must be 1, .* are discret
 make_train(ENV, OwnPolicy(), policy_components=4) | has a policy_network of its own
 make_train(ENV, gasil_jax.GASIL(), bonus="softmax") | bonus 'softmax' is unk.*softplus
 taught(ENV, observation=np.ones((9, 3)), action=np.ones((9, 2))) | of size 3 and actions
-taught(Corridor(), observation=np.eye(4), action=[0, 3, 0, 0]) | to 3 as actions: the env
+taught(Corridor(), observation=np.eye(4), action=[0, 3, 0, 0]) | to 3 as actions: the en
 taught(ENV, observation=np.ones((2, 11)), action=[0, 1]) | as actions: .* vectors of
 SMALL.replace(expert="a.npz") | expert is a setting of gail, not of ppo
 SMALL.replace(reward_clip=1.0) | reward_clip has no effect: normalize_rewards is off
