@@ -393,7 +393,7 @@ def _weight(
 
 
 @jax.named_scope("constraint_rows")
-def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.LimitRows:
+def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.JointRows:
     """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
     joint = take(qpos, limits.qpos)
     above_low, below_high = joint - limits.low, limits.high - joint
@@ -409,7 +409,7 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     index = np.full(qvel.shape[0], limits.dof.size)
     index[limits.dof] = np.arange(limits.dof.size)
     none = jnp.zeros((1, qvel.shape[1]), jnp.float32)
-    return newton.LimitRows(
+    return newton.JointRows(
         *(take(jnp.concatenate([x, none]), index) for x in map(materialize, of_limit))
     )
 
@@ -514,18 +514,16 @@ def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     return Strength.of(model, weight, solver), residual
 
 
-def friction_rows(
-    friction: Strength | None, qvel: jax.Array
-) -> newton.FrictionRows | None:
+def friction_rows(friction: Strength, qvel: jax.Array) -> newton.JointRows:
     """Return the dry friction of the degrees of freedom at qvel (V, B)."""
-    if friction is None or friction.bound is None:
-        return None
-    impedance = friction.impedance(jnp.zeros_like(qvel))
-    weight = _weight(impedance, friction.inverse_weight)
-    return newton.FrictionRows(
-        reference=jnp.asarray(-friction.impedance.damping) * qvel,
-        weight=jnp.where(friction.bound > 0, weight, 0.0),
-        bound=jnp.broadcast_to(friction.bound, qvel.shape),
+    inverse_weight, solimp, most = friction
+    weight = _weight(solimp(jnp.zeros_like(qvel)), inverse_weight)
+    bound = jnp.broadcast_to(jnp.asarray(most), qvel.shape)
+    return newton.JointRows(
+        sign=jnp.ones_like(qvel),
+        reference=jnp.asarray(-solimp.damping) * qvel,
+        weight=jnp.where(bound > 0, weight, 0.0),
+        bound=bound,
     )
 
 

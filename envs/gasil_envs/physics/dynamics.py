@@ -195,7 +195,9 @@ def forward(
         )
         for x in groups
     ]
-    limits = constraints.limit_rows(dynamics.layout.limits, qpos, qvel)
+    joints = [constraints.limit_rows(dynamics.layout.limits, qpos, qvel)]
+    if dynamics.layout.friction is not None:
+        joints.append(constraints.friction_rows(dynamics.layout.friction, qvel))
     others = [
         constraints.other_rows(*x, qpos, qvel=qvel) for x in dynamics.layout.others
     ]
@@ -210,9 +212,8 @@ def forward(
             smooth.inertia,
             force,
             state.qacc_warmstart,
-            limits,
+            tuple(joints),
             (*rows, *others),
-            constraints.friction_rows(dynamics.layout.friction, qvel),
         )
         solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
