@@ -339,11 +339,17 @@ def _euler(
             of_qvel = dynamics.tendons.of_qvel
             constant = constant + of_qvel.T @ (model.tendon_damping[:, None] * of_qvel)
         damping: Any = (dt * constant).astype(np.float32)[..., None]
-        if implicitfast and not own.are_motors:
+        of_servos = implicitfast and not own.are_motors
+        if of_servos:
             damping = damping + dt * actuators.damping(
                 own, actuation, state.qpos, qvel=state.qvel
             )
-        qacc = solver.eliminate(now.inertia + damping, now.force)
+        if dynamics.presses and (of_servos or constant.any()):
+            # Large forces that balance each other are not added again.
+            lost = total(damping * qacc, 1)
+            qacc = qacc - solver.eliminate(now.inertia + damping, lost)
+        elif of_servos or constant.any():
+            qacc = solver.eliminate(now.inertia + damping, now.force)
     qvel = state.qvel + dt * qacc
     qpos = _integrate_positions(model, state.qpos, qvel)
     return PhysicsState(qpos, qvel, now.qacc), now.fields
