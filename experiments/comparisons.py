@@ -5,6 +5,7 @@ Verdicts are corrected by Holm's method for the number of comparisons in their f
 
 import dataclasses
 import functools
+import itertools
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,10 @@ LEVEL = 0.05
 #: The probability with which the effect `Comparison.visible` would be found.
 _POWER = 0.8
 _DRAWS = 10_000
+#: A permutation test is exact up to so many ways to split the seeds: ten against ten.
+_MOST_SPLITS = math.comb(20, 10)
+#: Beyond them so many ways are drawn: a family of 500 tests can still have a verdict.
+_RANDOM_SPLITS = 50_000
 #: With fewer seeds there is no verdict, and no interval, which would be far too narrow.
 FEWEST_SEEDS = 5
 #: The verdict on two curves that both return less than doing nothing.
@@ -118,13 +123,32 @@ def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
     return _draws(f"{panel}/{curve}", tuple(scores[panel, curve].tolist()))
 
 
+@functools.cache
+def _splits(first: int, seeds: int) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return ways to split seeds in two, (ways, seeds of a side), and if all are there.
+
+    All ways if they are few, else random ones. The numbers of the seeds ascend.
+    """
+    exact = math.comb(seeds, first) <= _MOST_SPLITS
+    if exact:
+        ways = itertools.combinations(range(seeds), first)
+        chosen = np.array(list(ways), np.uint8)
+    else:
+        rows = np.tile(np.arange(seeds, dtype=np.uint8), (_RANDOM_SPLITS, 1))
+        dealt = np.random.default_rng(0).permuted(rows, axis=1)
+        chosen = np.sort(dealt[:, :first], axis=1)
+    rest = np.ones((len(chosen), seeds), bool)
+    rest[np.arange(len(chosen))[:, None], chosen] = False
+    return chosen, np.nonzero(rest)[1].reshape(len(chosen), -1), exact
+
+
 def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     """Return the p-value of a permutation test for two curves, of (seeds,) each.
 
     It is the share of the ways to divide all seeds between the two curves in which the
-    interquartile means are at least as far apart, estimated by random ways. Unlike the
-    bootstrap's it is valid for few seeds too: for five against five it is at least
-    0.008.
+    interquartile means are at least as far apart. Up to ten seeds against ten it is
+    exact; for more it is estimated by random ways. Unlike the bootstrap's it is valid
+    for few seeds too: for five against five it is at least 0.008.
     """
 
     def distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
@@ -132,18 +156,18 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
 
     # The pair in either order is the same test and has the same random numbers.
     pair = sorted([ours.tolist(), other.tolist()])
-    rows = np.tile(np.concatenate(pair), (_DRAWS, 1))
-    rows = np.random.default_rng(0).permuted(rows, axis=1)
-    dealt = distance(*np.split(rows, [len(pair[0])], axis=1))
+    pooled = np.sort(np.concatenate(pair))
+    first, second, exact = _splits(len(pair[0]), len(pooled))
+    dealt = distance(pooled[first], pooled[second])
     # Sums in another order differ by rounding.
-    as_far = dealt >= distance(ours, other) * (1 - 1e-9)
-    return float((1 + as_far.sum()) / (1 + _DRAWS))
+    as_far = int((dealt >= distance(ours, other) * (1 - 1e-9)).sum())
+    return as_far / len(dealt) if exact else (1 + as_far) / (1 + len(dealt))
 
 
 def bootstrap_p(drawn: np.ndarray) -> float:
     """Return the p-value of bootstrap samples of an effect, (draws,)."""
     beyond = min(int((drawn <= 0).sum()), int((drawn >= 0).sum()))
-    return min(1.0, 2 * (1 + beyond) / (1 + len(drawn)))
+    return min(1.0, 2 * beyond / len(drawn))
 
 
 def compare(
@@ -154,9 +178,9 @@ def compare(
     The p-value is the percentile bootstrap's: twice the share of draws on the other
     side of 0. With few seeds that is too small. So for two curves it is the larger of
     the bootstrap's and the permutation test's; for a difference of differences it is
-    the bootstrap's alone. Holm's method multiplies the smallest p-value by the number
-    of comparisons, the next by one less, and so on, and makes none smaller than the one
-    before.
+    the bootstrap's, at least that of one draw. Holm's method multiplies the smallest
+    p-value by the number of comparisons, the next by one less, and so on, and makes
+    none smaller than the one before.
     """
     effects = {}
     for key, terms in family.items():
@@ -166,9 +190,10 @@ def compare(
         drawn = np.sum([w * draws(scores, *curve) for w, *curve in terms], axis=0)
         middle = sum(w * float(interquartile_mean(scores[p, c])) for w, p, c in terms)
         enough = all(len(x) >= FEWEST_SEEDS and np.isfinite(x).all() for x in sides)
-        p_value = bootstrap_p(drawn) if enough else 1.0
-        if enough and len(sides) == 2:
-            p_value = max(p_value, permutation_p(*sides))
+        p_value = 1.0
+        if enough:
+            least = permutation_p(*sides) if len(sides) == 2 else 2 / _DRAWS
+            p_value = max(least, bootstrap_p(drawn))
         effects[key] = Effect(middle, p_value, drawn)
     return judged(effects, dropped)
 

@@ -18,7 +18,7 @@ from experiments.curves import Figure
 from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from experiments.store import RESULTS
-from gasil_jax import evaluation, train
+from gasil_jax import evaluation, rollout
 from gasil_jax.host import output_file
 from gasil_jax.host.environments import make_env
 
@@ -41,7 +41,7 @@ def measure(env: Any, key: jax.Array, episodes: int) -> Return:
         lambda observation, key: jnp.zeros(shape),
         key,
         num_episodes=episodes,
-        num_steps=train.max_episode_steps(env),
+        num_steps=rollout.max_episode_steps(env),
     )["episode_return"]
     values = np.asarray(returns, np.float64)
     mean, error = float(values.mean()), float(values.std(ddof=1)) / np.sqrt(episodes)

@@ -167,7 +167,7 @@ def train(stored: Program, setup: Setup) -> dict[Run, Record]:
         run.env, run.algorithm, (run.seed,), settings=settings, recording=recording
     )
     with input_checked():
-        env = training.prepare(sweep, [stored], stored.path, num_devices=setup.devices)
+        env = training.prepare(sweep, [stored], num_devices=setup.devices)
     _add_session(stored, setup)
     with (
         interruption.noted(_HOW_TO_CONTINUE),

@@ -1,22 +1,19 @@
 """List the commands of the package: ``python -m gasil_jax``."""
 
-import ast
-import pathlib
 import sys
 from collections.abc import Sequence
 
 import gasil_jax
 from gasil_jax.errors import unknown
 
-#: The modules that have a command line.
-COMMANDS = ("run", "sweep", "evaluate", "render", "plot")
-
-
-def _summary(command: str) -> str:
-    """Return the first line of a command's module, without importing it."""
-    path = pathlib.Path(__file__).with_name("cli") / f"{command}.py"
-    documentation = ast.get_docstring(ast.parse(path.read_text())) or ""
-    return documentation.partition("\n")[0].partition(":")[0].rstrip(".")
+#: The modules that have a command line, with what they do.
+COMMANDS = {
+    "run": "Train an agent",
+    "sweep": "Train a sweep",
+    "evaluate": "Evaluate the policies of a run",
+    "render": "Make a film of a run's policy",
+    "plot": "Plot one or several runs",
+}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -28,10 +25,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         about = (gasil_jax.__doc__ or "").partition("\n")[0]
         print(f"gasil_jax {gasil_jax.__version__}: {about}")
         print("\nCommands, each with --help:")
-        for command in COMMANDS:
-            print(f"  python -m gasil_jax.{command:14} {_summary(command)}")
+        for command, summary in COMMANDS.items():
+            print(f"  python -m gasil_jax.{command:14} {summary}")
     else:
-        print("error:", unknown("command", given[0], COMMANDS), file=sys.stderr)
+        print("error:", unknown("command", given[0], [*COMMANDS]), file=sys.stderr)
         return 2
     return 0
 

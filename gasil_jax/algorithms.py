@@ -136,10 +136,7 @@ class Algorithm:
 def schedule_factor(schedule: Schedule, env_steps: jax.Array) -> jax.Array:
     """Return a schedule's factor, float32 (), at `env_steps`, float32 ().
 
-    Args:
-      schedule: an Optax schedule, or (steps, factor) points with increasing steps. The
-        factor is linear between points and constant beyond them.
-      env_steps: number of environment steps that the run has taken.
+    Between points it is linear, and constant beyond them.
     """
     if callable(schedule):
         return jnp.asarray(schedule(env_steps), jnp.float32)
@@ -172,11 +169,7 @@ _COLUMNS = frozenset(
 
 
 def check(algorithm: Algorithm) -> None:
-    """Check that every setting of an algorithm is allowed, alone and with the others.
-
-    Raises:
-      ValueError: if one is not; the message names the value and what is allowed.
-    """
+    """Raise `ValueError` unless every setting is allowed, alone and with the others."""
     if not isinstance(algorithm, Algorithm):
         raise refusal("algorithm", algorithm, "a gasil_jax.Algorithm")
     agent, rewards, config = algorithm.agent, algorithm.rewards, algorithm.config
@@ -208,11 +201,7 @@ def check(algorithm: Algorithm) -> None:
 
 
 def check_numbers(algorithm: Algorithm, hyperparameters: Mapping[str, Any]) -> None:
-    """Check that numbers by name are hyperparameters of an algorithm, and allowed.
-
-    Raises:
-      ValueError: if one is not; the message names the value and what is allowed.
-    """
+    """Raise `ValueError` unless an algorithm has these numbers, and allows them."""
     if not isinstance(hyperparameters, Mapping):
         raise refusal("hyperparameters", hyperparameters, "numbers by name")
     for name in hyperparameters:

@@ -15,7 +15,7 @@ from gasil_jax import algorithms, networks
 from gasil_jax.agents import Agent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.context import Sizes, sizes_of
-from gasil_jax.errors import refusal, shown
+from gasil_jax.errors import shown
 
 
 def check(env: Any, algorithm: Algorithm) -> None:
@@ -50,29 +50,6 @@ def check_environment(env: Any) -> None:
     # Ours and Brax's need no check.
     if not type(innermost).__module__.startswith(("gasil_envs.", "brax.envs.")):
         user_environment.check(type(innermost).__name__, env, env)
-
-
-def check_key(key: Any) -> None:
-    """Raise `ValueError` unless this is a single random key, of either kind."""
-    dtype = getattr(key, "dtype", None)
-    typed = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not typed and dtype != jnp.uint32:
-        raise refusal("key", key, "like jax.random.key(0)")
-    if typed and key.shape:
-        raise ValueError(
-            f"key has shape {key.shape}: it must be a single key (to train with "
-            "several, use jax.vmap)"
-        )
-
-
-def check_state(state: Any) -> None:
-    """Raise `ValueError` unless this is the training state of one run."""
-    if not hasattr(state, "iteration"):
-        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
-    if shape := jnp.shape(state.iteration):
-        raise ValueError(
-            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
-        )
 
 
 def _check_networks(agent: Any, sizes: Sizes) -> None:

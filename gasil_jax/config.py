@@ -72,6 +72,29 @@ def validate_switch(name: str, value: Any) -> None:
         raise refusal(name, value, "True or False")
 
 
+def validate_key(key: Any) -> None:
+    """Raise `ValueError` unless this is a single random key, of either kind."""
+    dtype = getattr(key, "dtype", None)
+    typed = dtype is not None and jax.numpy.issubdtype(dtype, jax.dtypes.prng_key)
+    if not typed and dtype != jax.numpy.uint32:
+        raise refusal("key", key, "like jax.random.key(0)")
+    if typed and key.shape:
+        raise ValueError(
+            f"key has shape {key.shape}: it must be a single key (to train with "
+            "several, use jax.vmap)"
+        )
+
+
+def validate_state(state: Any) -> None:
+    """Raise `ValueError` unless this is the training state of one run."""
+    if not hasattr(state, "iteration"):
+        raise refusal("state", state, "a TrainState, as gasil_jax.init returns")
+    if shape := jax.numpy.shape(state.iteration):
+        raise ValueError(
+            f"state is a batch of {shape[0]} states: take one of them, or jax.vmap this"
+        )
+
+
 def validate_number(name: str, value: Any, allowed: Range) -> None:
     """Raise `ValueError` unless a value is a number in the range, or traced."""
     if shape := getattr(value, "shape", ()):
@@ -154,7 +177,7 @@ def choice(default: str, allowed: Iterable[str]) -> Any:
     names = tuple(allowed)
 
     def check(name: str, value: Any) -> None:
-        if value not in names:
+        if not isinstance(value, str) or value not in names:
             raise ValueError(unknown(name, value, names))
 
     return _field(default, check)
@@ -269,13 +292,7 @@ def ranges(kind: Any) -> Mapping[str, Range]:
 
 
 def validate(settings: Any) -> None:
-    """Check that every setting of a config, an agent or a reward model is allowed.
-
-    Numbers that are traced have no value yet: of those only the shapes are checked.
-
-    Raises:
-      ValueError: if a value is not allowed; the message names the value and the range.
-    """
+    """Raise `ValueError` unless a part's settings are allowed, as far as not traced."""
     for field in dataclasses.fields(settings):
         name, value = field.name, getattr(settings, field.name)
         if "check" not in field.metadata:
@@ -291,11 +308,7 @@ def validate(settings: Any) -> None:
 
 
 def validate_config(config: Config) -> None:
-    """Check that every value of a config is allowed, alone and with the others.
-
-    Raises:
-      ValueError: if a value is not allowed; the message names the value and the range.
-    """
+    """Raise `ValueError` unless a config is allowed, each value and all together."""
     validate(config)
     for name in ("num_envs", "minibatch_size"):
         size, batch_steps = getattr(config, name), config.batch_steps

@@ -8,12 +8,11 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_envs import wrappers
-from gasil_jax.buffer import History
 from gasil_jax.config import Config
 from gasil_jax.distributions import Distribution
 from gasil_jax.errors import shown
 from gasil_jax.normalization import Normalizer
-from gasil_jax.rollout import Rollout
+from gasil_jax.rollout import History, Rollout
 
 Metrics = dict[str, jax.Array]
 
@@ -83,11 +82,7 @@ class Context(struct.PyTreeNode):
 
 
 def merge_metrics(source: str, *groups: Metrics) -> Metrics:
-    """Return groups of metrics as one, float32 () by name.
-
-    Raises:
-      ValueError: if two have the same name, or one is not a single number.
-    """
+    """Return groups of metrics as one, float32 () by name, if no name is twice."""
     merged: Metrics = {}
     for name, value in (pair for group in groups for pair in group.items()):
         what = f"metric {shown(name)} of {source}"

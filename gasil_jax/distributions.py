@@ -162,12 +162,7 @@ CATEGORICAL = Distribution(
 
 
 def of(env: Any, components: int) -> Distribution:
-    """Return the distribution of a policy's actions in an environment.
-
-    Args:
-      env: the environment.
-      components: number of Gaussians where actions are vectors.
-    """
+    """Return the distribution of actions; `components` is the number of Gaussians."""
     if wrappers.is_discrete(env):
         return CATEGORICAL
     return MIXTURE if components > 1 else GAUSSIAN

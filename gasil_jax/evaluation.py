@@ -9,9 +9,9 @@ import numpy as np
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import checks, policy, train
+from gasil_jax import checks, policy, rollout
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.config import Range, validate_switch
+from gasil_jax.config import Range, validate_key, validate_switch
 from gasil_jax.errors import refusal, shown
 
 _COUNT = Range(1, 2**31 - 1, whole=True)
@@ -21,7 +21,7 @@ _COUNT = Range(1, 2**31 - 1, whole=True)
 def evaluate(
     env: Any,
     algorithm: Algorithm,
-    state: train.TrainState,
+    state: Any,
     *,
     key: jax.Array,
     num_episodes: int,
@@ -51,7 +51,7 @@ def evaluate(
         policy.from_state(state, env),
         key,
         num_episodes=num_episodes,
-        num_steps=train.max_episode_steps(env),
+        num_steps=rollout.max_episode_steps(env),
         deterministic=deterministic,
     )
 
@@ -69,13 +69,9 @@ def run_episodes(
     """Do what `evaluate` does, with a policy ``act(observation, key)`` -> action.
 
     Episodes are truncated after `num_steps` steps.
-
-    Raises:
-      ValueError: as in `evaluate`, or if `env` is no environment, or if `act` is no
-        function or returns no actions.
     """
     checks.check_environment(env)
-    checks.check_key(key)
+    validate_key(key)
     if num_episodes not in _COUNT:
         raise refusal("num_episodes", num_episodes, _COUNT)
     validate_switch("deterministic", deterministic)
@@ -123,17 +119,16 @@ def evaluate_in_gymnasium(
     seed: int = 0,
     num_steps: int | None = None,
 ) -> dict[str, np.ndarray]:
-    """Run complete episodes of a policy in Gymnasium, with MuJoCo in C.
+    """Run complete episodes, one after the other, in Gymnasium, with MuJoCo in C.
 
     Args:
       gymnasium_id: name of the task, such as "Walker2d-v5".
       act: observation -> action, as from `numpy_policy.load`.
-      num_episodes: number of episodes, which run one after the other.
+      num_episodes: number of episodes.
       seed: seed of the first episode; each next episode has the next seed.
       num_steps: steps after which an episode is truncated; default the task's own.
 
-    Returns:
-      "episode_return" and "episode_length", (num_episodes,) each.
+    Returns what `evaluate` does.
     """
     import gymnasium  # Here alone: it takes long.
 

@@ -12,10 +12,8 @@ def read(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of a file by name, all or those that are asked for.
 
-    Nothing is unpickled. The file's own checksums tell whether it is damaged.
-
-    Raises:
-      ValueError: if the file can't be read; the message is one line.
+    Nothing is unpickled. The file's own checksums tell whether it is damaged: then a
+    `ValueError` says so in a line.
     """
     try:
         # NumPy leaves a file open that it can't read, and warns of an altered header.

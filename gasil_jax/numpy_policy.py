@@ -152,19 +152,10 @@ def inputs(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
 
 
 def output(weights: Mapping[str, Any], observation: Any, xp: Any = np) -> Any:
-    """Return the output of the policy's network.
+    """Return the output of the policy's network, by numpy or jax.numpy (`xp`).
 
     It is the mean of the actions, or the logits of discrete ones, (..., action); for a
-    mixture see `components`.
-
-    Args:
-      weights: the arrays from `read`.
-      observation: (..., obs), not normalized.
-      xp: the array module, numpy or jax.numpy.
-
-    Raises:
-      ValueError: if the observation has another size than the policy's, or if the
-        policy's network is none of the package's.
+    mixture see `components`. Observations, (..., obs), are not normalized.
     """
     if "network" in weights:
         raise ValueError(OWN_NETWORK)

@@ -10,7 +10,8 @@ from flax import struct
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import checks, normalization, numpy_policy
+from gasil_jax import normalization, numpy_policy
+from gasil_jax.config import validate_key, validate_state
 from gasil_jax.distributions import CATEGORICAL, GAUSSIAN, MIXTURE
 from gasil_jax.networks import POLICY_LAYERS
 
@@ -60,12 +61,8 @@ def weights(state: Any, env: Any) -> dict[str, Any]:
 
 
 def from_state(state: Any, env: Any) -> Callable[..., jax.Array]:
-    """Return the policy of a single `TrainState`, as `saved.load_policy` does.
-
-    Raises:
-      ValueError: if it is a batch of states, or none.
-    """
-    checks.check_state(state)
+    """Return the policy of a single `TrainState`, as `saved.load_policy` does."""
+    validate_state(state)
     return make(weights(state, env))
 
 
@@ -98,7 +95,7 @@ def make(weights: Mapping[str, Any]) -> Callable[..., jax.Array]:
             if key is None:
                 action = distribution.mode(parameters)
             else:
-                checks.check_key(key)
+                validate_key(key)
                 action = distribution.sample(key, parameters)
             return distribution.executed(action, arrays.get("low"), arrays.get("high"))
 

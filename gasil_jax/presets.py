@@ -3,26 +3,22 @@
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
 the settings; a flag overrides a row.
 
-"tuned" has the settings that a search chose for an agent on a task, with the number of
-environments and the normalization of rewards that it ran with. Alpha suits only that
-normalization. Where the agent returns more with the learning rate, lambda, gamma and
-initial std that PPO's or PPO+GASIL's search chose, it has these
-(docs/results/ablations.md). The rows of locomotion tasks, and those of PPO and
-PPO+GASIL on the dense point mass, are from the stored searches; the other rows of the
-point mass are from earlier ones. Adaptive imitation has one setting for all tasks of
-MuJoCo but ant and humanoid with delayed rewards, where what its searches chose returns
-more than twice as much. An agent without a row for a task starts from the defaults.
+"tuned" has what a search chose for an agent on a task, with the number of environments
+and the normalization of rewards that it ran with; alpha suits only that normalization.
+Which rows are from which search is in docs/running.md. An agent without a row for a
+task starts from the defaults.
 
-"scaled" has one rule for PPO on all tasks: learning rate, exploration and lambda depend
-on the dimension of an action. Delayed rewards are decomposed.
+"scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
+learning rate, exploration and lambda depend on the dimension of an action, which counts
+as two where actions are discrete. Delayed rewards are decomposed. "tuned" has this rule
+for PPO+GASIL+NOVELTY too.
 
 "gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
 for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
 
 "paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
 values of its appendix. Of what the appendix searches it has what our search chose on
-each task (docs/results/paper_figures.md), and the defaults where we did not
-search. Rewards are normalized.
+each task (docs/results/paper_figures.md). Rewards are normalized.
 """
 
 import json
@@ -64,6 +60,10 @@ ACTION_SIZES = {
     "reacher": 2,
     "pusher": 7,
 }
+#: The agents that follow the rule "scaled", in any environment; by default the last.
+RULED = ("ppo", "ppo+novelty", "ppo+gasil+novelty")
+#: The dimension that discrete actions count as, in that rule.
+DISCRETE_SIZE = 2
 # One setting of adaptive imitation for every task, chosen on two seeds a task with
 # rewards delayed by 20 steps (experiments/notes/adaptive_ablation.md).
 _ADAPTIVE = {
@@ -102,13 +102,11 @@ def _searched(rewards: str, adaptive: Overrides | None = None) -> Rows:
 
 
 def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
-    """Return settings of PPO that depend on the dimension of an action.
+    """Return settings that depend on the dimension of an action.
 
-    The searches suggest that the learning rate and the exploration must be smaller for
-    actions with more dimensions (docs/results/paper_figures.md). Noise in more
-    dimensions also makes the returns after an action vary more, so lambda falls too.
-    All three fall linearly from two dimensions to eight; more dimensions have the
-    values of eight (docs/results/ablations.md).
+    They fall linearly from two dimensions to eight, and are the same for more
+    (docs/results/ablations.md): with more dimensions the searches chose a smaller
+    learning rate and less exploration, and noise makes returns vary more.
     """
     share = min(max((action_size - 2) / 6, 0.0), 1.0)
 
@@ -128,9 +126,15 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
 
 def _scaled(decompose_rewards: bool) -> Rows:
     return {
-        (env, "ppo"): scaled(size, decompose_rewards)
+        (env, agent): scaled(size, decompose_rewards)
+        for agent in RULED
         for env, size in ACTION_SIZES.items()
     }
+
+
+def is_ruled(agent: str, name: str) -> bool:
+    """Return whether a preset has the rule "scaled" for an agent."""
+    return agent in RULED if name == "scaled" else (name, agent) == (DEFAULT, RULED[-1])
 
 
 class Preset(NamedTuple):
@@ -191,8 +195,8 @@ def preset(
       agent: name of the agent, or its class.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
-      action_size: dimension of an action, which "scaled" needs for an environment that
-        is no locomotion task of ours.
+      action_size: dimension of an action, `DISCRETE_SIZE` if actions are discrete. The
+        rule "scaled" needs it for an environment that is no locomotion task of ours.
 
     Returns:
       The defaults, overridden by what the preset has for all tasks and by its row. If
@@ -214,16 +218,17 @@ def preset(
     ours, others = ("point_mass", *ACTION_SIZES), (*worlds.forms(), "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", env, ours, forms=others))
-    if name == "scaled" and kind.name == "ppo" and action_size is not None:
-        row = scaled(action_size, decompose_rewards=reward_delay > 1)
+    if is_ruled(kind.name, name):
+        size = ACTION_SIZES.get(env) if action_size is None else action_size
+        if size is None:
+            raise ValueError(
+                f"action_size is None: preset {name!r} needs the dimension of {env}'s "
+                "actions, which is env.action_size, or 2 if they are discrete"
+            )
+        row = scaled(size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
     rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
-    if lacking is not None and (name, kind.name) == ("scaled", "ppo"):
-        raise ValueError(
-            f"action_size is None: preset 'scaled' needs the dimension of {env}'s "
-            "actions, which is env.action_size"
-        )
     if lacking is not None and name != DEFAULT:
         tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
         raise ValueError(f"{lacking}: it has {agents} on {tasks}")
@@ -233,7 +238,8 @@ def preset(
 
 def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str | None:
     """Return in words that a preset has nothing for an agent on a task, or None."""
-    if PRESETS[name].every or (env, agent) in _rows(name, reward_delay):
+    rows = _rows(name, reward_delay)
+    if PRESETS[name].every or is_ruled(agent, name) or (env, agent) in rows:
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"
     return (

@@ -1,4 +1,4 @@
-"""Collect one batch of experience and keep count of the running episodes."""
+"""Collect one batch of experience; keep the running episodes and the last steps."""
 
 from collections.abc import Callable
 from typing import Any
@@ -77,6 +77,37 @@ class EnvironmentStates(struct.PyTreeNode):
     # int32, the age in steps at which the episode began; above 0 in the first one only.
     # The episode is truncated when this plus its length reaches the limit.
     starting_age: jax.Array
+
+
+class History(struct.PyTreeNode):
+    """The last H steps of each of N environments, as a ring buffer over time.
+
+    Attributes:
+      observation: float32 (N, H, obs).
+      action: float32 (N, H, action).
+      reward: float32 (N, H), the reward, never normalized; in an agent's context it may
+        be decomposed. NaN in faulty steps, in the last step of an episode that was cut
+        short, and where no step is recorded yet.
+      ended: bool (N, H), whether the step was the last of its episode.
+      cursor: int32 (), index at which the next step is written.
+      next_observation: float32 (N, H, obs), after the action; None if it is not kept.
+    """
+
+    observation: jax.Array
+    action: jax.Array
+    reward: jax.Array
+    ended: jax.Array
+    cursor: jax.Array
+    next_observation: jax.Array | None = None
+
+    def in_time(self, ring: jax.Array) -> jax.Array:
+        """Return a ring (N, H, ...) of this history in time order, oldest first."""
+        return jnp.roll(ring, -self.cursor, axis=1)
+
+
+def max_episode_steps(env: Any) -> int:
+    """Return the environment's limit, after which an episode is truncated, or 1000."""
+    return int(getattr(env, "episode_length", 1000))
 
 
 def _cast(x: Any, dtype: Any) -> jax.Array:
@@ -249,6 +280,69 @@ def collect(
         return carry, transition
 
     return jax.lax.scan(step, environments, jax.random.split(key, num_steps))
+
+
+def init_history(
+    num_envs: int,
+    num_steps: int,
+    max_episode_steps: int,
+    *,
+    observation_size: int,
+    action_size: int,
+    keep_next: bool = False,
+    num_episodes: int = 1,
+) -> History:
+    """Return an empty history, long enough for every episode that ends in a batch.
+
+    Its length H is a multiple of `num_steps`, so that a batch is written in one piece,
+    and at least the length of `num_episodes` episodes and a batch. With `keep_next` the
+    history also has the observation after each action.
+    """
+    batches = -(-(num_episodes * max_episode_steps + num_steps) // num_steps)
+    length = batches * num_steps
+
+    # Each field needs its own array: a shared one could not be donated.
+    def observations() -> jax.Array:
+        return jnp.zeros((num_envs, length, observation_size), jnp.float32)
+
+    return History(
+        observation=observations(),
+        action=jnp.zeros((num_envs, length, action_size), jnp.float32),
+        # No episode begins before the first recorded step, and none is valid there.
+        reward=jnp.full((num_envs, length), jnp.nan, jnp.float32),
+        ended=jnp.ones((num_envs, length), bool),
+        cursor=jnp.int32(0),
+        next_observation=observations() if keep_next else None,
+    )
+
+
+@jax.named_scope("good_trajectories")
+def record(history: History, batch: Rollout) -> History:
+    """Return the history with a batch, (time, N, ...), written over the oldest steps.
+
+    The batch's rewards are the environment's own.
+    """
+    cursor, next_ring = history.cursor, history.next_observation
+    if next_ring is not None:
+        next_ring = write(next_ring, batch.next_observation, cursor)
+    # A NaN marks an episode without a valid return: one with a faulty step, or one that
+    # was cut short.
+    reward = jnp.where(batch.faulty | batch.cut_short, jnp.nan, batch.reward)
+    return History(
+        observation=write(history.observation, batch.observation, cursor),
+        action=write(history.action, batch.action, cursor),
+        reward=write(history.reward, reward, cursor),
+        ended=write(history.ended, batch.ended, cursor),
+        cursor=(cursor + batch.reward.shape[0]) % history.reward.shape[1],
+        next_observation=next_ring,
+    )
+
+
+def write(ring: jax.Array, new: jax.Array, cursor: jax.Array) -> jax.Array:
+    """Return a ring (N, H, ...) with a batch (time, N, ...) written at `cursor`."""
+    return jax.lax.dynamic_update_slice_in_dim(
+        ring, jnp.swapaxes(new, 0, 1), cursor, axis=1
+    )
 
 
 def metrics(batch: Rollout) -> dict[str, jax.Array]:

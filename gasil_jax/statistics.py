@@ -1,8 +1,7 @@
 """Interquartile means and their intervals over seeds (Agarwal et al. 2021)."""
 
-import numbers
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,8 +9,6 @@ from gasil_jax.errors import refusal
 
 #: Fewer seeds tell too little for an interval.
 FEWEST_SEEDS = 5
-_FEWEST_POINTS = 8
-_MOST_GROUPS = 8
 
 
 def interquartile_mean(scores: np.ndarray, axis: int = -1) -> np.ndarray:
@@ -108,27 +105,3 @@ def in_words(scores: Mapping[str, np.ndarray]) -> str:
 def performance_profile(scores: np.ndarray, levels: np.ndarray) -> np.ndarray:
     """Return the share of seeds above each level: (seeds,), (levels,) -> (levels,)."""
     return np.mean(scores[:, None] > levels[None, :], axis=0)
-
-
-def are_numbers(values: Sequence[Any]) -> bool:
-    """Return whether all values are numbers, which a bool is not."""
-    return all(isinstance(x, numbers.Real) and not isinstance(x, bool) for x in values)
-
-
-def groups(values: Sequence[Any]) -> list[np.ndarray]:
-    """Return the indices of points that have the same value, or neighbouring ones.
-
-    Neighbouring numbers form a group if there are eight points or more, and fewer than
-    two for each value. A group then has about three values, or more where that would
-    make more than eight groups. Groups are in the order of their values, which is that
-    of their first points if they are not all numbers.
-    """
-    distinct = list(dict.fromkeys(values))
-    count = len(distinct)
-    if are_numbers(values):
-        distinct.sort()
-        if _FEWEST_POINTS <= len(values) < 2 * len(distinct):
-            count = min(_MOST_GROUPS, -(-len(distinct) // 3))
-    group_of = {x: i * count // len(distinct) for i, x in enumerate(distinct)}
-    of_point = np.array([group_of[x] for x in values], int)
-    return [np.flatnonzero(of_point == group) for group in range(count)]

@@ -16,12 +16,12 @@ from gasil_envs.precision import full_precision
 from gasil_jax import checks, distributions, learner, normalization, ppo, rollout
 from gasil_jax.agents.interface import call
 from gasil_jax.algorithms import Algorithm, check_numbers
-from gasil_jax.buffer import History, init_history, record
+from gasil_jax.config import validate_key, validate_state
 from gasil_jax.context import Context, Metrics, merge_metrics, sizes_of
 from gasil_jax.distributions import Distribution
 from gasil_jax.networks import Value
 from gasil_jax.ppo import ActorCritic
-from gasil_jax.rollout import Rollout
+from gasil_jax.rollout import History, Rollout
 
 
 class TrainState(struct.PyTreeNode):
@@ -117,7 +117,7 @@ def _begin(
     key: jax.Array,
     hyperparameters: Mapping[str, Any] | None,
 ) -> TrainState:
-    checks.check_key(key)
+    validate_key(key)
     own = {} if hyperparameters is None else hyperparameters
     check_numbers(algorithm, own)
     return first_state(env, algorithm.replace(**own), key)
@@ -138,7 +138,7 @@ def first_state(env: Any, algorithm: Algorithm, key: jax.Array) -> TrainState:
     key, policy_key, value_key, env_key, agent_key, rewards_key = jax.random.split(
         key, 6
     )
-    age_limit = max_episode_steps(env) if config.stagger_episodes else None
+    age_limit = rollout.max_episode_steps(env) if config.stagger_episodes else None
     history = _init_history(env, algorithm)
     history_steps = 0 if history is None else history.reward.shape[1]
     sizes = sizes_of(env, config.num_envs, history_steps)
@@ -182,7 +182,7 @@ def train_step(
       ValueError: if the state is a batch of states, or if one of the agent's functions
         returns what it must not; the message names the function.
     """
-    checks.check_state(state)
+    validate_state(state)
     data = algorithm.agent.data() if data is None else data
     algorithm = algorithm.at(state.hyperparameters, state.iteration)
     keys = Keys(*jax.random.split(state.key, 6))
@@ -227,10 +227,10 @@ def collect(
             keys.act,
             distribution=distribution,
             num_steps=algorithm.config.num_steps,
-            max_episode_steps=max_episode_steps(env),
+            max_episode_steps=rollout.max_episode_steps(env),
             gamma=algorithm.config.gamma,
         )
-    history = None if state.history is None else record(state.history, batch)
+    history = None if state.history is None else rollout.record(state.history, batch)
     context = Context(
         rollout=batch,
         history=history,
@@ -317,11 +317,6 @@ def learn(
     ), metrics
 
 
-def max_episode_steps(env: Any) -> int:
-    """Return the environment's limit, after which an episode is truncated, or 1000."""
-    return int(getattr(env, "episode_length", 1000))
-
-
 def _init_actor_critic(
     env: Any, algorithm: Algorithm, initial_std: jax.Array, *, keys: Any
 ) -> ActorCritic:
@@ -347,10 +342,10 @@ def _init_history(env: Any, algorithm: Algorithm) -> History | None:
     asked = [algorithm.agent.history_episodes, *(x.history_episodes for x in models)]
     if max(asked) == 0:
         return None
-    return init_history(
+    return rollout.init_history(
         config.num_envs,
         config.num_steps,
-        max_episode_steps(env),
+        rollout.max_episode_steps(env),
         observation_size=env.observation_size,
         action_size=wrappers.action_size(env),
         keep_next=any(model.keeps_next_observation for model in models),

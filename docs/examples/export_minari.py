@@ -17,7 +17,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from minari.data_collector import EpisodeBuffer
 
-from gasil_jax import train
+from gasil_jax import rollout
 from gasil_jax.host import saved
 
 
@@ -42,7 +42,7 @@ def main() -> None:
     num_actions, episodes = getattr(env, "num_actions", None), []
     for i in range(len(seeds)):
         buffer = jax.tree.map(lambda x, i=i: x[i], every)
-        for seen, done, total in whole_episodes(buffer, train.max_episode_steps(env)):
+        for seen, done, total in whole_episodes(buffer, rollout.max_episode_steps(env)):
             last = np.arange(len(seen)) == len(seen) - 1
             actions = done if num_actions is None else done.argmax(axis=-1)
             steps = {"observations": np.append(seen, seen[-1:], 0), "actions": actions}

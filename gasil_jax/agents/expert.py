@@ -98,21 +98,19 @@ def check(source: str | None, sizes: Sizes) -> None:
             "minari:NAME"
         )
     observation, action = load(source)
-    size = sizes.action if action.ndim == 1 else action.shape[1]
-    if action.ndim == 1 and not sizes.discrete:
+    given = observation.shape[1], sizes.action if action.ndim == 1 else action.shape[1]
+    numbered = sizes.discrete and np.isin(action, np.arange(sizes.action)).all()
+    if action.ndim == 1 and not numbered:
+        kind = f"whole numbers from 0 to {sizes.action - 1}"
+        if not sizes.discrete:
+            kind = f"vectors of size {sizes.action}"
         raise ValueError(
-            f"expert {source!r} has numbers as actions: the environment's are vectors "
-            f"of size {size}"
+            f"expert {source!r} has numbers from {action.min():g} to {action.max():g} "
+            f"as actions: the environment's are {kind}"
         )
-    if action.ndim == 1 and not np.isin(action, np.arange(size)).all():
+    if given != (sizes.observation, sizes.action):
         raise ValueError(
-            f"expert {source!r} has actions from {action.min():g} to "
-            f"{action.max():g}: the environment's are whole numbers from 0 to "
-            f"{size - 1}"
-        )
-    if (observation.shape[1], size) != (sizes.observation, sizes.action):
-        raise ValueError(
-            f"expert {source!r} has observations of size {observation.shape[1]} and "
-            f"actions of size {size}: the environment's are of size "
-            f"{sizes.observation} and {sizes.action}"
+            f"expert {source!r} has observations of size {given[0]} and actions of "
+            f"size {given[1]}: the environment's are of size {sizes.observation} and "
+            f"{sizes.action}"
         )

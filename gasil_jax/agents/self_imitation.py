@@ -27,10 +27,10 @@ from flax import struct
 
 from gasil_jax import learner, normalization, ppo
 from gasil_jax.agents.interface import Agent
-from gasil_jax.buffer import History
 from gasil_jax.config import count, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.ppo import ActorCritic
+from gasil_jax.rollout import History
 
 _PRIORITY_EXPONENT, _IMPORTANCE_EXPONENT = 0.6, 0.1
 _MIN_PRIORITY, _MIN_SCALE, _MIN_SAMPLES = 1e-6, 1e-8, 64

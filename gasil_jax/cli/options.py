@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import importlib
 import pathlib
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -27,13 +28,12 @@ from gasil_jax.host import (
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import note
-from gasil_jax.host.progress import announced
 from gasil_jax.host.sweep import Recording, Sweep
 from gasil_jax.rewards import REWARD_MODELS
 
 #: The options that `--help` shows; `--help-all` shows all.
 COMMON = frozenset(
-    "env agent preset seeds out resume evaluate_every log grid random "
+    "env agent preset seeds out resume evaluate_every video_every log grid random "
     "reward_delay obs_noise action_noise physics total_steps num_envs batch_steps "
     "minibatch_size num_epochs hidden_sizes learning_rate gamma gae_lambda "
     "entropy_coefficient initial_std decompose_rewards alpha discriminator_updates "
@@ -55,12 +55,12 @@ class Options:
         gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
         --list-envs prints all names.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
-        ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
-        settings: this help shows those of the one that is named beside it. Several,
-        separated by commas, are trained side by side, each from its own preset: the
-        points of a sweep.
+        ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
+        MODULE:CLASS. Each has its own settings: this help shows those of the one that
+        is named beside it. Several, separated by commas, are trained side by side, each
+        from its own preset: the points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
-        agent; scaled, one rule of PPO for all continuous tasks; gymnax, one setting for
+        agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
         seed. Options override them. The defaults that this help shows are the preset's
         if --env is named beside --help.
@@ -69,8 +69,8 @@ class Options:
         its number.
       out: folder, created if it is missing; default runs/ENV-AGENT-TIME.
       resume: train what is missing in the folder `out`, with its settings. total_steps
-        and seeds may grow; checkpoint_every, keep_checkpoints, devices and log may
-        differ. If the folder holds nothing yet, training begins.
+        and seeds may grow; checkpoint_every, keep_checkpoints, video_every, devices and
+        log may differ. If the folder holds nothing yet, training begins.
       config: the config.json of another run: what it holds is used for all options that
         are not given.
       init_from: folder of a run, whose best seed's policy, values and normalizer of
@@ -135,10 +135,11 @@ def read(
     With --resume, options that are not given are those of the sweep in the folder,
     whose points come first; with --config those of a file; otherwise the preset's.
     """
-    if "--list-envs" in parsing.words(arguments):
+    words = parsing.words(arguments)
+    if "--list-envs" in words:
         print(*environments.names(), sep="\n")
         raise HelpShown(0)
-    first, stored = _first_options(arguments), None
+    first, stored = _first_options(words), None
     if first.resume:
         if first.out is None:
             raise InputError("resume needs --out and the folder to continue")
@@ -161,9 +162,9 @@ def read(
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
     _add_algorithms(parser, every)
-    values = parser.read(arguments, _why_not(every[0]))
+    values = parser.read(words, _why_not(every[0]))
     options = kind(**parser.fields(values, "run"))
-    given = {name: getattr(values, name) for name in parser.given(arguments)}
+    given = {name: getattr(values, name) for name in parser.given(words)}
     switches = [model.switch for model in REWARD_MODELS]
 
     def changed(algorithm: Algorithm) -> Algorithm:
@@ -213,7 +214,7 @@ def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
         parser.add_fields(type(other.agent), other.agent.name, other.agent)
 
 
-def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
+def _first_options(words: Sequence[str]) -> argparse.Namespace:
     """Return the options that decide which others there are, and their defaults."""
 
     def delay(text: str) -> int:
@@ -230,7 +231,7 @@ def _first_options(arguments: Sequence[str] | None) -> argparse.Namespace:
     parser.add_argument("--rewards", nargs="*")
     parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
     parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
-    return parser.parse_known_args(parsing.words(arguments))[0]
+    return parser.parse_known_args(words)[0]
 
 
 def _defaults(
@@ -283,7 +284,7 @@ def _default(name: str, first: argparse.Namespace) -> Algorithm:
             agent,
             preset,
             reward_delay=first.reward_delay,
-            action_size=_action_size(first.env, preset),
+            action_size=_action_size(first.env, agent.name, preset),
         )
     models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
     algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
@@ -304,19 +305,15 @@ def _switches(algorithm: Algorithm) -> dict[str, Any]:
     return {x.switch: algorithm.settings[x.switch] for x in REWARD_MODELS}
 
 
-def _action_size(env: str, preset: str) -> int | None:
+def _action_size(env: str, agent: str, preset: str) -> int | None:
     """Return the dimension of an action, if a preset needs it for an environment."""
-    if preset != "scaled" or env in presets.ACTION_SIZES:
+    if not presets.is_ruled(agent, preset) or env in presets.ACTION_SIZES:
         return None
     # The environment's arrays start JAX.
     devices.use_devices(Settings(), None, environments.available_cores())
-    with announced(env, "building the environment"):
-        built = environments.make_env(env)
+    built = environments.make_env(env)
     if environments.is_discrete(built):
-        raise InputError(
-            "preset is 'scaled', a rule for the dimension of an action: those of "
-            f"{env} are discrete, it must be another preset, such as 'gymnax'"
-        )
+        return presets.DISCRETE_SIZE
     return int(built.action_size)
 
 
@@ -379,6 +376,9 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
 
 def _check(options: Options, requested: Sweep) -> None:
     """Raise `InputError` if a value is not allowed. Nothing is built or compiled."""
+    if requested.recording.video_every is not None:
+        # What follows imports MuJoCo; this says before with what it is to draw.
+        importlib.import_module("gasil_jax.host.video")
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
@@ -386,8 +386,8 @@ def _check(options: Options, requested: Sweep) -> None:
             algorithms.check(each)
         trackers.check(requested.recording.log)
     check_minimum(options, devices=1)
-    counts = ("checkpoint_every", "keep_checkpoints", "evaluate_every")
-    check_minimum(requested.recording, **dict.fromkeys(counts, 1), evaluate_episodes=1)
+    counts = (x for x in names(Recording) if x != "log")
+    check_minimum(requested.recording, **dict.fromkeys(counts, 1))
     check_minimum(requested.settings, max_episode_steps=1)
     if options.out is not None:
         if not options.resume and getattr(options, "shard", None) is None:
@@ -410,10 +410,7 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
-    """Print a note if the default preset has nothing for the agent and the task.
-
-    Other presets refuse an agent or a task that they have nothing for.
-    """
+    """Print a note if the default preset has nothing for the agent and the task."""
     for each in requested.algorithms:
         lacking = presets.describe_lack(
             options.env,

@@ -102,11 +102,10 @@ class Parser(argparse.ArgumentParser):
 
     def read(
         self,
-        arguments: Sequence[str] | None,
+        given: Sequence[str],
         why_not: Callable[[str], str | None] = lambda name: None,
     ) -> argparse.Namespace:
-        """Return the values of a command line."""
-        given = words(arguments)
+        """Return the values of the words of a command line."""
         if "--version" in given:
             print(importlib.import_module("gasil_jax").__version__)
             raise HelpShown(0)
@@ -130,9 +129,9 @@ class Parser(argparse.ArgumentParser):
             raise InputError(f"option {flag} is unknown: {meant}")
         return values
 
-    def given(self, arguments: Sequence[str] | None) -> list[str]:
+    def given(self, words: Sequence[str]) -> list[str]:
         """Return the names of the options that a command line has."""
-        flags = (word.partition("=")[0] for word in words(arguments))
+        flags = (word.partition("=")[0] for word in words)
         bare = {x.removeprefix("--").replace("-", "_") for x in flags if x[:2] == "--"}
         return [x for x in self._names if x in bare or f"no_{x}" in bare]
 
@@ -158,7 +157,7 @@ def read(kind: type[T], arguments: Sequence[str] | None, program: str) -> T:
     positional = [x.name.upper() for x in fields if x.metadata.get("positional")]
     parser = Parser(program, f"{' '.join(positional)} [options]", kind)
     parser.add_fields(kind, "options")
-    return kind(**parser.fields(parser.read(arguments), "options"))
+    return kind(**parser.fields(parser.read(words(arguments)), "options"))
 
 
 def _default(field: Any) -> Any:

@@ -55,23 +55,16 @@ class Options:
 
 
 class Curves(NamedTuple):
-    """The curves of one run.
+    """The curves of one run."""
 
-    Attributes:
-      env: the environment's name; empty if a file does not say it.
-      label: label in the legend.
-      env_steps: (points,), or what else is on the x axis.
-      returns: (seeds, points), mean return of the episodes since the previous point.
-      final: (seeds,), mean return over the last tenth of training.
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each; None if there are none.
-    """
-
-    env: str
-    label: str
-    env_steps: np.ndarray
+    env: str  # the environment's name; empty if a file does not say it
+    label: str  # label in the legend
+    env_steps: np.ndarray  # (points,), or what else is on the x axis
+    # (seeds, points), mean return of the episodes since the previous point.
     returns: np.ndarray
-    final: np.ndarray
+    final: np.ndarray  # (seeds,), mean return over the last tenth of training
+    # "env_steps" and "mean" of the evaluations during training, (seeds, evaluations)
+    # each; None if there are none.
     evaluations: Mapping[str, np.ndarray] | None
 
 
@@ -131,11 +124,7 @@ def _read_tables(
 
 
 def read_csv(path: pathlib.Path, label: str | None, columns: Sequence[str]) -> Curves:
-    """Return the curves of another library's CSV file, or of a folder of them.
-
-    Raises:
-      InputError: if two columns are not named, or a file lacks one or has no number.
-    """
+    """Return the curves of another library's CSV file, or of a folder of them."""
     if len(columns) != 2:
         raise InputError(
             f"columns has {len(columns)} names: {path} needs two, of x and the return"

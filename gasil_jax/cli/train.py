@@ -26,28 +26,16 @@ from gasil_jax.host.sweep import Sweep
 def train(
     options: Options, requested: Sweep, program: str, *, shard: tuple[int, int] = (1, 1)
 ) -> None:
-    """Train the runs of a shard that are missing in the folder of the options.
-
-    If no run is missing then, its results are written and told.
-    """
+    """Train the runs of a shard that the folder lacks; if it lacks none then, tell."""
     runs = requested.part(*shard)
     needed = requested.unfinished(options.out or NOWHERE, runs)
     with input_checked():
-        env = training.prepare(
-            requested,
-            needed,
-            options.out or pathlib.Path("runs"),
-            num_devices=options.devices,
-        )
+        env = training.prepare(requested, needed, num_devices=options.devices)
         policy = requested.start and start.load(requested.start, env, needed)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
-    with folders.lock(folder, seconds=60.0):
-        if not (options.resume or shard[1] > 1) or not folders.has_config(folder):
-            folders.refuse_used(folder)
-        # Another shard may have begun, or added points, since.
-        requested = requested.continued_from(folder)
-        requested.write(folder)
+    # Another shard may have begun, or added points, since.
+    requested = requested.begun_in(folder, resume=options.resume or shard[1] > 1)
     how = (
         f"continue with: python -m {program} --resume --out {shlex.quote(str(folder))}"
     )

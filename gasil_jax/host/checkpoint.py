@@ -177,17 +177,12 @@ def _key_impl(key: Any) -> Any:
 
 
 class Record(TypedDict):
-    """Facts about a checkpoint that can be read without its state.
+    """Facts about a checkpoint that can be read without its state."""
 
-    Attributes:
-      metrics_rows: number of rows of metrics.csv when it was written.
-      evaluations_rows: number of rows of evaluations.csv.
-      score: mean score of the policies or, without evaluations, mean of the returns
-        since the checkpoint before; None if neither is known.
-    """
-
-    metrics_rows: int
-    evaluations_rows: int
+    metrics_rows: int  # number of rows of metrics.csv when it was written
+    evaluations_rows: int  # number of rows of evaluations.csv
+    # Mean score of the policies or, without evaluations, mean of the returns since the
+    # checkpoint before; None if neither is known.
     score: float | None
 
 
@@ -199,17 +194,11 @@ class _Manifest(TypedDict):
 
 
 class Checkpoint(NamedTuple):
-    """A complete, undamaged checkpoint.
+    """A complete, undamaged checkpoint."""
 
-    Attributes:
-      folder: its folder.
-      iteration: number of iterations before it was written.
-      record: the record that `write` was given.
-    """
-
-    folder: pathlib.Path
-    iteration: int
-    record: Record
+    folder: pathlib.Path  # its folder
+    iteration: int  # number of iterations before it was written
+    record: Record  # the record that `write` was given
 
     def restore(self, like: Any) -> Any:
         """Return the saved state; see the function `restore`."""
@@ -368,11 +357,7 @@ def delete_partial(root: pathlib.Path) -> None:
 
 
 def prune(root: pathlib.Path, keep: int) -> None:
-    """Delete all checkpoints but the newest `keep` and the best one.
-
-    A checkpoint that can't be deleted is left. `delete_partial` deletes it when
-    training continues.
-    """
+    """Delete all checkpoints but the newest `keep` and the best one, where possible."""
     try:
         folders = _folders(root)
         scores = _scores(folders)

@@ -70,10 +70,7 @@ def describe(algorithm: Algorithm) -> dict[str, Any]:
 
 
 def read(values: Mapping[str, Any]) -> Algorithm:
-    """Return the algorithm that `describe` describes, also after a way through JSON.
-
-    Settings that are missing have their defaults.
-    """
+    """Return what `describe` describes; settings that are missing have defaults."""
     if "agent" not in values:
         raise InputError("agent is missing")
     settings = dict(values)

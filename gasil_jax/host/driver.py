@@ -23,6 +23,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint
 from gasil_jax.host.evaluations import Evaluation
 from gasil_jax.host.interruption import Interrupted, Interruption
+from gasil_jax.host.intervals import Interval
 from gasil_jax.host.members import Members
 from gasil_jax.host.output_file import note
 from gasil_jax.host.programs import Training
@@ -92,33 +93,23 @@ Callback = Callable[[FitProgress], bool | None]
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """The result of training.
+    """The result of training."""
 
-    Attributes:
-      states: the members' states after the last iteration.
-      training: how this process trained.
-      unsaved: why the last checkpoint could not be written, to raise once the results
-        are written; None if it was.
-    """
-
-    states: Any
-    training: Training
+    states: Any  # the members' states after the last iteration
+    training: Training  # how this process trained
+    # Why the last checkpoint could not be written, to raise once the results are
+    # written; None if it was.
     unsaved: checkpoint.WriteError | None
 
 
 @dataclasses.dataclass
 class _Training:
-    """Members in training.
+    """Members in training."""
 
-    Attributes:
-      members: the members.
-      states: their states, padded once training is compiled; None for the first ones.
-      done: number of iterations so far.
-    """
-
-    members: Members
+    members: Members  # the members
+    # Their states, padded once training is compiled; None for the first ones.
     states: Any = None
-    done: int = 0
+    done: int = 0  # number of iterations so far
     _seconds_per_iteration: float = math.inf
 
     @property
@@ -168,26 +159,20 @@ class _Checkpoints:
 
     def __init__(self, members: Members, root: pathlib.Path, recording: Recording):
         self._members, self._root = members, root
-        self._keep, self._interval = recording.keep_checkpoints, math.inf
-        if recording.checkpoint_every is not None:
-            steps = members.config.batch_steps
-            self._interval = math.ceil(recording.checkpoint_every / steps)
+        self._keep = recording.keep_checkpoints
+        self.interval = Interval(recording.checkpoint_every, members.config)
         self._saved_at = time.monotonic()
         self._best_score = checkpoint.best_score(root)
         if self._keep:
             checkpoint.check_writable(root)
 
-    def iterations_left(self, done: int) -> float:
-        """Return the iterations to the next checkpoint; infinity if time decides."""
-        return self._interval - done % self._interval
-
     def is_due(self, done: int, score: float | None) -> bool:
         """Return whether it is time for a checkpoint or the score is the best yet."""
         if score is not None and score > self._best_score:
             return True
-        if math.isinf(self._interval):
+        if math.isinf(self.interval.length):
             return time.monotonic() - self._saved_at > _SECONDS_BETWEEN_CHECKPOINTS
-        return done % self._interval == 0
+        return self.interval.ends(done)
 
     def save(self, done: int, states: Any, record: checkpoint.Record) -> None:
         """Write a checkpoint, and delete older ones that need not be kept."""
@@ -239,22 +224,10 @@ def drive(
 ) -> Outcome:
     """Train to the end, from the newest undamaged checkpoint if the folder has one.
 
-    After each chunk a signal of `interruption` is answered with a checkpoint, and the
-    callback may end training. The trackers are closed at the end.
-
-    Args:
-      members: the members to train.
-      folder: the folder of metrics.csv, evaluations.csv and checkpoints/.
-      labels: columns that identify the members in the tables, (members,) each.
-      recording: what is recorded, and when.
-      steps_before: environment steps that `progress` has already counted.
-
-    Raises:
-      Interrupted: if a signal was received; a checkpoint was written first.
-      InputError: if the checkpoint has another state, if a table lacks rows, or if the
-        folder holds results but no undamaged checkpoint.
-      OSError: if the folder can't be written, or if the disk is full. If only the last
-        checkpoint can't, the outcome has the error.
+    After each chunk a signal is answered with a checkpoint and `Interrupted`, and the
+    callback may end training. The labels, (members,) each, identify the members in the
+    tables; `progress` has counted `steps_before` environment steps already. The
+    trackers are closed at the end.
     """
     root = folder / "checkpoints"
     training, record = _restored(members, root, progress)
@@ -275,6 +248,14 @@ def drive(
             trackers=trackers,
         )
     checkpoints = _Checkpoints(members, root, recording)
+    videos = None
+    if recording.video_every is not None:
+        # It imports MuJoCo, which not every training needs.
+        from gasil_jax.host.video import Videos
+
+        every, where = recording.video_every, folder / "videos"
+        videos = Videos(members, where, every=every, trackers=trackers)
+    intervals = [x.interval for x in (checkpoints, evaluation, videos) if x is not None]
     first, score = training.done, None
     # The finite returns since the last checkpoint, after an empty array.
     returns = [np.empty(0, np.float32)]
@@ -285,9 +266,12 @@ def drive(
     def evaluate() -> _Columns | None:
         nonlocal score
         score = None
-        if evaluation is None or not evaluation.is_due(training.done):
+        if evaluation is None:
             return None
-        with progress.aside("evaluating the policies"):
+        if training.left and not evaluation.interval.ends(training.done):
+            return None
+        first = "" if evaluation.seconds else "compiling and "
+        with progress.aside(f"{first}evaluating the policies"):
             scores = evaluation.score(training.states, training.done)
         mean = float(scores["mean"].mean(dtype=np.float64))
         score = mean if math.isfinite(mean) else None
@@ -312,8 +296,11 @@ def drive(
 
     started = time.monotonic()
     if training.left:
-        progress.phase("compiling", steps_of(first))
-        with interruption.answering(_AFTER_COMPILATION):
+        what = "compiling training and first states"
+        with (
+            interruption.answering(_AFTER_COMPILATION),
+            progress.aside(what, at_once=True),
+        ):
             training.compile()
     compile_seconds = time.monotonic() - started
 
@@ -324,10 +311,7 @@ def drive(
         evaluate()
     while training.left and not stopped and interruption.signal is None:
         done = training.done
-        most = checkpoints.iterations_left(done)
-        if evaluation is not None:
-            most = min(most, evaluation.iterations_left(done))
-        metrics = training.train_chunk(most)
+        metrics = training.train_chunk(min(x.left(done) for x in intervals))
         table.write(metrics)
         log(trackers, metrics)
         ended = metrics["episode_return"]
@@ -342,9 +326,13 @@ def drive(
         scores = evaluate()
         if checkpoints.is_due(training.done, score):
             save()
+        if videos is not None and (
+            not training.left or videos.interval.ends(training.done)
+        ):
+            videos.film(training.states, training.done, progress)
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))
-    train_seconds = time.monotonic() - started
+    train_seconds = time.monotonic() - started - (videos.seconds if videos else 0.0)
     unsaved = None
     try:
         save()

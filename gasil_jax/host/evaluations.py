@@ -5,7 +5,6 @@ evaluation, with the mean, lowest and highest return of its episodes and their m
 length. Evaluations do not change training, not by a single bit.
 """
 
-import math
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -14,6 +13,7 @@ import jax
 import numpy as np
 
 from gasil_jax.evaluation import evaluate
+from gasil_jax.host.intervals import Interval
 from gasil_jax.host.members import Members
 from gasil_jax.host.tables import TableWriter
 from gasil_jax.host.trackers import Tracker
@@ -33,10 +33,9 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
 class Evaluation:
     """Evaluates all members with one compiled program, sharded as training is.
 
-    The untrained and the final policy are always evaluated.
-
     Attributes:
       table: writes evaluations.csv.
+      interval: when to evaluate, beside the untrained and the final policy.
       seconds: time of all evaluations in this process, including compilation.
     """
 
@@ -62,19 +61,10 @@ class Evaluation:
             )
 
         self.table, self.seconds = table, 0.0
-        self._interval = math.ceil(every / members.config.batch_steps)
+        self.interval = Interval(every, members.config)
         self._members, self._trackers = members, trackers
         self._seeds = members.to_devices(np.array(members.seeds, np.uint32))
         self._score = members.vmap(score)
-
-    def iterations_left(self, done: int) -> int:
-        """Return the iterations from `done` to the next evaluation, at least one."""
-        return self._interval - done % self._interval
-
-    def is_due(self, done: int) -> bool:
-        """Return whether to evaluate after `done` iterations."""
-        last = self._members.config.num_iterations
-        return done % self._interval == 0 or done == last
 
     def score(self, states: Any, done: int) -> dict[str, np.ndarray]:
         """Evaluate, write and log; return evaluations.csv's columns, (members,)."""

@@ -155,7 +155,7 @@ def fit(
             if points is None and folders.has_config(path):
                 # Those of the folder.
                 requested = dataclasses.replace(requested, points=())
-            requested = _begin(path, requested, resume=resume)
+            requested = requested.begun_in(path, resume=resume, option="folder")
         missing = requested.unfinished(path)
         outcomes = training.train_programs(
             env,
@@ -243,18 +243,3 @@ def _describe(
         recording=recording,
         only_python=why,
     )
-
-
-def _begin(folder: pathlib.Path, requested: Sweep, *, resume: bool) -> Sweep:
-    """Write config.json, and return the sweep with the points that it had before."""
-    with folders.lock(folder, option="folder", seconds=60.0):
-        if not folders.has_config(folder):
-            folders.refuse_used(folder, option="folder")
-        elif not resume:
-            raise ValueError(
-                f"folder is {folder}, where training has begun: give resume=True or "
-                "another folder"
-            )
-        grown = requested.continued_from(folder, option="folder")
-        grown.write(folder)
-    return grown

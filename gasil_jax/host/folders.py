@@ -48,10 +48,7 @@ def create_new(name: str) -> pathlib.Path:
 
 
 def check_writable(folder: pathlib.Path) -> None:
-    """Raise `InputError` if the folder, or its first parent that exists, is read-only.
-
-    It is not created.
-    """
+    """Raise `InputError` if a folder, or where it would be made, is read-only."""
     existing = folder
     while not existing.exists():
         existing = existing.parent
@@ -122,10 +119,11 @@ def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
         for path in folder.iterdir()
     )
     if used:
-        more = ", or continue what is in it with --resume"
+        resume = "--resume" if option == "out" else "resume=True"
+        more = f", or continue what is in it with {resume}"
         raise InputError(
             f"{option} is {folder}, which is not empty: name a new or an empty folder"
-            f"{more if has_config(folder) and option == 'out' else ''}"
+            f"{more if has_config(folder) else ''}"
         )
 
 

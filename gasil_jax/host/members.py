@@ -66,9 +66,7 @@ def advance_members(
 ) -> tuple[Any, train.Metrics]:
     """Train members side by side for at most `chunk_size(config)` iterations.
 
-    Returns:
-      The new states, and metrics (members, chunk). The first `num_iterations` columns
-      are filled and the others are NaN.
+    Metrics are (members, chunk), NaN after the first `num_iterations` columns.
     """
     # A jitted function is traced once for both uses, which saves seconds.
     step = jax.jit(
@@ -102,20 +100,13 @@ class Members:
     """The members that train in one program.
 
     Their arrays are padded to a multiple of the number of devices: (padded, ...).
-
-    Attributes:
-      env: one environment.
-      algorithm: the algorithm that the members share.
-      seeds: absolute seed number of each member.
-      hyperparameters: the numbers of each member, by name.
-      devices: the devices that the members are sharded over.
     """
 
-    env: Any
-    algorithm: Algorithm
-    seeds: Sequence[int]
-    hyperparameters: Sequence[Mapping[str, Any]]
-    devices: Sequence[jax.Device]
+    env: Any  # one environment
+    algorithm: Algorithm  # the algorithm that the members share
+    seeds: Sequence[int]  # absolute seed number of each member
+    hyperparameters: Sequence[Mapping[str, Any]]  # the numbers of each member, by name
+    devices: Sequence[jax.Device]  # the devices that the members are sharded over
 
     @property
     def config(self) -> Config:
@@ -162,10 +153,7 @@ class Members:
 
     @functools.cached_property
     def first_states(self) -> Any:
-        """The jitted function of seeds and hyperparameters, (padded,), for `init`.
-
-        A member's key comes from its seed alone.
-        """
+        """The jitted function of seeds and hyperparameters, (padded,), for `init`."""
 
         @full_precision
         def init_one(seed: Any, hyperparameters: Any) -> Any:
@@ -203,14 +191,7 @@ class Members:
         return jax.device_put(self.algorithm.agent.data(), everywhere)
 
     def compile(self, states: Any = None) -> tuple[Any, Callable[..., Any]]:
-        """Return the states to start from, and the compiled `advance`.
-
-        They are the first states or those to continue from, (members, ...).
-
-        Raises:
-          InputError: if an array of the program does not fit into memory; nothing is
-            compiled then.
-        """
+        """Return the states to start from, (padded, ...), and `advance`, compiled."""
         shapes = jax.tree.map(
             lambda x: x.update(sharding=self._sharding_of(x)),
             jax.eval_shape(self.init),
@@ -228,11 +209,7 @@ class Members:
         return first.result(), compiled.result()
 
     def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function of one member's arrays as one of all members' arrays.
-
-        It is sharded like the training, compiles when it is first called, and takes and
-        returns padded arrays, (padded, ...).
-        """
+        """Return a function of one member for all, (padded, ...), sharded likewise."""
         return jax.jit(self._shard(jax.vmap(function), P("members")))
 
     def train(
@@ -304,15 +281,7 @@ def make_members(
     *,
     devices: Sequence[jax.Device] | None = None,
 ) -> Members:
-    """Return members to train side by side. Nothing is compiled yet.
-
-    Args:
-      env: one environment.
-      algorithm: the algorithm that the members share.
-      seeds: absolute seed number of each member.
-      hyperparameters: for each member, values that replace numbers of the algorithm.
-      devices: the devices to shard over, default all, at most one for each member.
-    """
+    """Return members to train side by side, by default on all devices."""
     every = hyperparameters or [{}] * len(seeds)
     numbers = [{**algorithm.hyperparameters, **one} for one in every]
     devices = list(devices or jax.devices())[: len(seeds)]

@@ -54,10 +54,7 @@ def errors_named(path: pathlib.Path) -> Iterator[None]:
 
 
 def flush(descriptor: int) -> None:
-    """Make the operating system write an open file or folder to the disk.
-
-    Some file systems can't be told to: they write when they choose.
-    """
+    """Make the operating system write an open file or folder to the disk, if it can."""
     try:
         os.fsync(descriptor)
     except OSError as error:

@@ -9,9 +9,7 @@ import numpy as np
 
 from gasil_jax.statistics import (
     FEWEST_SEEDS,
-    are_numbers,
     bootstrap_interval,
-    groups,
     interquartile_mean,
 )
 
@@ -35,16 +33,10 @@ _MOST_PARTS = 50
 def binned_returns(
     env_steps: np.ndarray, returns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean returns over equal parts of training, at most 50.
+    """Return the mean returns, (seeds, iterations), over 50 equal parts of training.
 
-    Parts in which not every seed has ended an episode are left out.
-
-    Args:
-      env_steps: (iterations,).
-      returns: (seeds, iterations), NaN where no episode ended.
-
-    Returns:
-      The steps at the end of each part, (parts,), and the means, (seeds, parts).
+    Parts in which not every seed has ended an episode are left out. They are given by
+    the steps at their ends, (parts,), and the means, (seeds, parts).
     """
     parts = np.array_split(np.arange(len(env_steps)), min(_MOST_PARTS, len(env_steps)))
     complete = [x for x in parts if np.isfinite(returns[:, x]).any(axis=1).all()]
@@ -89,19 +81,10 @@ def draw_returns(
     style: str = "-",
     unit: float = 1e6,
 ) -> None:
-    """Draw the interquartile mean over seeds and, from five seeds on, its 95% interval.
+    """Draw the interquartile mean of returns, (seeds, points), and its 95% interval.
 
-    Args:
-      axes: where to draw.
-      env_steps: (points,).
-      returns: (seeds, points).
-      evaluations: "env_steps" and "mean" of the evaluations during training, (seeds,
-        evaluations) each, whose interquartile mean is dashed; None if there are none.
-      color: color of the line, the interval and the evaluations.
-      label: label in the legend.
-      evaluated: label of the evaluations.
-      style: style of the line.
-      unit: number of steps that is 1 on the axis.
+    The interval is drawn from five seeds on. `evaluations` has "env_steps" and "mean",
+    (seeds, evaluations) each, drawn dashed; `unit` is the number of steps that is 1.
     """
     if len(env_steps):
         steps, middle = env_steps / unit, interquartile_mean(returns, axis=0)
@@ -135,10 +118,9 @@ def learning_curve(
     title: str,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Save the returns over environment steps as a PNG: all seeds, mean and interval.
+    """Save the returns, (seeds, iterations), as a PNG: all seeds, mean and interval.
 
-    Steps are (iterations,), and returns (seeds, iterations), NaN where no episode
-    ended; evaluations are as in `draw_returns`.
+    Evaluations are as in `draw_returns`.
     """
     from matplotlib.figure import Figure
 
@@ -174,17 +156,9 @@ def final_returns(
     env_steps: np.ndarray,
     curves: np.ndarray,
 ) -> None:
-    """Save every seed's final return in a row for each point, the best mean first.
+    """Save every seed's return, (points, seeds), in a row a point, the best mean first.
 
-    Beside them are the learning curves of the best points.
-
-    Args:
-      path: the image file.
-      labels: the name of each point.
-      returns: (points, seeds).
-      title: title of the picture.
-      env_steps: of each point's curves, (points, iterations).
-      curves: returns during training, (points, seeds, iterations).
+    Beside them are the best points' curves, (points, seeds, iterations).
     """
     from matplotlib.figure import Figure
 
@@ -232,15 +206,10 @@ def marginals(
     best: int | None,
     left_out: int,
 ) -> None:
-    """Save a panel for each hyperparameter: the points' returns over its values.
+    """Save a panel for each hyperparameter: the points' mean returns over its values.
 
-    Args:
-      path: the image file.
-      values: each point's value of every hyperparameter that varies, by name.
-      returns: each point's mean final return, (points,), all finite.
-      title: title of the picture.
-      best: index of the point that is marked as the best; None for none.
-      left_out: number of points without a return, which are not among these.
+    Returns are (points,), without the `left_out` points that have none; the `best` one
+    is marked.
     """
     from matplotlib.figure import Figure
 
@@ -262,8 +231,6 @@ def marginals(
     named: dict[str, Any] = {"title": title, "title_fontsize": "large"}
     figure.legend(handles, labels, frameon=False, **named, **above)
     text = "point: mean over its seeds; mean: over the points of each value"
-    if any(len(groups(x)) < len(set(x)) for x in values.values()):
-        text += ", or of neighbouring values with fewer than two points each"
     if left_out:
         text += f"; {left_out} of {len(returns) + left_out} points are left out, "
         text += "because a seed has no return"
@@ -292,9 +259,8 @@ def _mark_tried(axes: Any, values: np.ndarray) -> None:
 def _draw_marginal(
     axes: Any, values: Sequence[Any], returns: np.ndarray, *, best: int | None
 ) -> None:
-    """Draw the points' returns over one hyperparameter, and the means of its groups."""
-    parts = groups(values)
-    if are_numbers(values):
+    """Draw the points' returns over one hyperparameter, and the mean of each value."""
+    if not isinstance(values[0], str):
         places, style = np.array(values, float), "-D"
         positive = places[places > 0.0]
         # In floats 3e-4 / 3e-5 is less than 10.
@@ -302,15 +268,14 @@ def _draw_marginal(
             # Values that are not positive lie on the linear part about 0.
             linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
             axes.set_xscale("symlog" if linear else "log", **linear)
-        distinct = np.unique(places)
-        if len(distinct) <= _MOST_TICKS:
-            _mark_tried(axes, distinct)
+        if len(tried := np.unique(places)) <= _MOST_TICKS:
+            _mark_tried(axes, tried)
     else:
         names = list(dict.fromkeys(values))
         places, style = np.array([names.index(x) for x in values]), "D"
         axes.set_xticks(range(len(names)), [str(name) for name in names])
-    centres = [np.median(places[part]) for part in parts]
-    means = [returns[part].mean() for part in parts]
+    centres = np.unique(places)
+    means = [returns[places == centre].mean() for centre in centres]
     axes.plot(centres, means, style, color=COLORS[0], markersize=6, label="mean")
     axes.plot(places, returns, "o", color="0.3", markersize=3, label="point")
     axes.margins(x=0.1)

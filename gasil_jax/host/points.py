@@ -63,10 +63,7 @@ def in_words(point: Point) -> str:
 def algorithm_of(
     point: Point, algorithms: Sequence[Algorithm]
 ) -> tuple[Algorithm, dict[str, Any]]:
-    """Return the algorithm of a point's agent, and the values that the point changes.
-
-    A point without an agent has the first algorithm.
-    """
+    """Return a point's algorithm, by default the first, and the values it changes."""
     values = dict(point)
     agent = values.pop("agent", algorithms[0].agent.name)
     for algorithm in algorithms:

@@ -30,62 +30,40 @@ NOWHERE = pathlib.Path(os.devnull)
 
 
 class Training(TypedDict):
-    """How a program was trained, the content of training.json.
-
-    Attributes:
-      iterations: number of iterations that were trained.
-      env_steps: environment steps over all members in the last process.
-      compile_seconds: seconds of compiling.
-      train_seconds: seconds of training, without evaluations.
-      evaluation_seconds: seconds of evaluations; None without any.
-      device: kind of the devices.
-      device_count: number of devices.
-      versions: versions of Python and packages.
-    """
+    """How a program was trained, the content of training.json."""
 
     iterations: int
-    env_steps: int
+    env_steps: int  # environment steps over all members in the last process
     compile_seconds: float
-    train_seconds: float
-    evaluation_seconds: float | None
+    train_seconds: float  # seconds of training, without evaluations and films
+    evaluation_seconds: float | None  # seconds of evaluations; None without any
     device: str
     device_count: int
     versions: dict[str, str | None]
 
 
 class _Listed(TypedDict):
-    """The content of program.json.
+    """The content of program.json."""
 
-    Attributes:
-      experiments: `Run.experiment` of the runs, each once.
-      runs: the index of its experiment and the seed of each run.
-      labels: `Program.labels`.
-    """
-
-    experiments: tuple[dict[str, Any], ...]
+    experiments: tuple[dict[str, Any], ...]  # `Run.experiment` of the runs, each once
+    # The index of its experiment and the seed of each run.
     runs: tuple[tuple[int, int], ...]
-    labels: dict[str, tuple[int, ...]]
+    labels: dict[str, tuple[int, ...]]  # `Program.labels`
 
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """Runs that differ in traced numbers alone, trained as one batch.
+    """Runs that differ in traced numbers alone, trained as one batch."""
 
-    Attributes:
-      runs: the runs, its members.
-      path: its folder, which may not exist yet.
-      labels: the columns that identify the members in its tables, (members,) each:
-        "seed" and others.
-      others: number of further members that are stored in its folder, of runs that
-        nobody has asked for.
-      indices: the place of each run among all members.
-    """
-
-    runs: tuple[Run, ...]
-    path: pathlib.Path = NOWHERE
+    runs: tuple[Run, ...]  # the members
+    path: pathlib.Path = NOWHERE  # its folder, which may not exist yet
+    # The columns that identify the members in its tables, (members,) each: "seed" and
+    # others.
     labels: Mapping[str, Sequence[int]] = dataclasses.field(default_factory=dict)
+    # Number of further members that are stored in its folder, of runs that nobody has
+    # asked for.
     others: int = 0
-    indices: tuple[int, ...] = ()
+    indices: tuple[int, ...] = ()  # the place of each run among all members
 
     @property
     def algorithm(self) -> Algorithm:

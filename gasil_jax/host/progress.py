@@ -17,19 +17,30 @@ from rich.table import Column
 from gasil_jax.statistics import interquartile_mean
 
 _SECONDS_BETWEEN_LINES = 10.0
+_SECONDS_BETWEEN_ANNOUNCEMENTS = 30.0
 _SECONDS_BEFORE_ANNOUNCEMENT = 1.0
 
 
 @contextlib.contextmanager
-def announced(title: str, name: str) -> Iterator[None]:
-    """Print a line to stderr if the `with` block takes more than a second."""
-    timer = threading.Timer(_SECONDS_BEFORE_ANNOUNCEMENT, _line, (title, name))
-    timer.daemon = True
-    timer.start()
+def announced(title: str, name: str, *, at_once: bool = False) -> Iterator[None]:
+    """Print a line to stderr if the `with` block takes more than a second.
+
+    While it lasts, further lines say for how long it has.
+    """
+    ended, activity = threading.Event(), _Activity(name)
+
+    def tell() -> None:
+        text, wait = name, 0.0 if at_once else _SECONDS_BEFORE_ANNOUNCEMENT
+        while not ended.wait(wait):
+            _line(title, text)
+            wait = _SECONDS_BETWEEN_ANNOUNCEMENTS
+            text = str(activity)
+
+    threading.Thread(target=tell, daemon=True).start()
     try:
         yield
     finally:
-        timer.cancel()
+        ended.set()
 
 
 def _line(title: str, text: str) -> None:
@@ -112,8 +123,8 @@ class Progress:
             _line(self._title, name)
 
     @contextlib.contextmanager
-    def aside(self, name: str) -> Iterator[None]:
-        """Show what the `with` block does, if it takes more than a second.
+    def aside(self, name: str, *, at_once: bool = False) -> Iterator[None]:
+        """Show what the `with` block does, if it takes more than a second or at once.
 
         Its time does not count towards the training speed.
         """
@@ -122,7 +133,7 @@ class Progress:
         self._bar.update(self._task, status=_Activity(name))
         with contextlib.ExitStack() as stack:
             if self._in_lines:
-                stack.enter_context(announced(self._title, name))
+                stack.enter_context(announced(self._title, name, at_once=at_once))
             yield
         self._bar.update(self._task, status=status)
         self._training_since += time.monotonic() - started
@@ -135,12 +146,7 @@ class Progress:
             _line(self._title, f"warning: {text}")
 
     def update(self, steps: int, returns: np.ndarray) -> None:
-        """Show progress.
-
-        Args:
-          steps: environment steps so far, over all members.
-          returns: (members, iterations) of the last chunk, NaN where no episode ended.
-        """
+        """Show all members' steps, and the last returns, (members, iterations)."""
         each = [row[np.isfinite(row)] for row in returns]
         each = [row.mean() for row in each if row.size]
         if each:

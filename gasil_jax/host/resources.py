@@ -1,9 +1,8 @@
-"""Check before compiling that programs fit the devices' memory and the disk."""
+"""Check before compiling that programs fit the devices' memory."""
 
 import contextlib
 import math
 import pathlib
-import shutil
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -29,19 +28,11 @@ _STATES_PER_EPISODE = 7
 
 
 class Need(NamedTuple):
-    """The bytes that one run needs.
+    """The bytes that one run needs."""
 
-    Attributes:
-      state: size of its `TrainState`, which is the size of a checkpoint.
-      memory: memory during training.
-      largest_part: what most of the memory is for, in words.
-      shared: memory of what all runs on a device share, the agent's data.
-    """
-
-    state: int
-    memory: int
-    largest_part: str
-    shared: int = 0
+    memory: int  # memory during training
+    largest_part: str  # what most of the memory is for, in words
+    shared: int = 0  # memory of what all runs on a device share, the agent's data
 
 
 def check(
@@ -49,13 +40,11 @@ def check(
     programs: Sequence[Program],
     recording: Recording,
     devices: Sequence[jax.Device],
-    folder: pathlib.Path,
 ) -> None:
-    """Raise `InputError`, with the sizes, if programs do not fit memory or disk."""
-    sizes = []
+    """Raise `InputError`, with the sizes, if programs do not fit the memory."""
     for each in programs:
-        count, one = len(each.runs), need(env, each.algorithm)
-        check_memory(one, each.algorithm, count, devices)
+        count = len(each.runs)
+        check_memory(need(env, each.algorithm), each.algorithm, count, devices)
         if recording.evaluate_every is not None:
             check_episodes(
                 env,
@@ -64,9 +53,6 @@ def check(
                 devices,
                 option="evaluate_episodes",
             )
-        sizes.append(one.state * count)
-    # One more, because the best checkpoint is kept too.
-    _check_disk(sizes, folder, recording.keep_checkpoints + 1, programs)
 
 
 def _size(tree: Any) -> int:
@@ -106,7 +92,7 @@ def need(env: Any, algorithm: Algorithm) -> Need:
         **steps,
     }
     largest = max(parts, key=lambda part: parts[part])
-    return Need(_size(state), memory, largest, data)
+    return Need(memory, largest, data)
 
 
 def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
@@ -211,9 +197,8 @@ def check_arrays(
 ) -> None:
     """Raise `InputError` if a single array of a traced program does not fit memory.
 
-    So a count that shapes an array is refused whatever it is, also a user's own. `need`
-    knows the arrays that are large together. The program itself is one function that
-    each of the devices runs.
+    So a count that shapes an array is refused whatever it is, also a user's own. The
+    program is one function that each of the devices runs.
     """
     inner = (x for part in core.subjaxprs(traced) for x in _arrays(part))
     largest, free = max(inner, key=_size, default=None), available(devices)
@@ -258,34 +243,6 @@ def check_episodes(
             f"{option} is {num_episodes}: the episodes of {num_policies} policies at "
             f"once need at least {_in_words(required)} of memory, and "
             f"{_in_words(free)} are free"
-        )
-
-
-def _check_disk(
-    sizes: Sequence[int],
-    folder: pathlib.Path,
-    num_checkpoints: int,
-    programs: Sequence[Program],
-) -> None:
-    """Raise `InputError` if checkpoints of these sizes do not fit the disk."""
-    while not folder.exists():
-        folder = folder.parent
-    written = 0
-    for each in programs:
-        # Earlier checkpoints, which new ones replace; damaged ones are kept.
-        for path in each.path.glob("checkpoints/[0-9]*[0-9]/**/*"):
-            # Another process may delete it meanwhile.
-            with contextlib.suppress(OSError):
-                written += path.stat().st_size if path.is_file() else 0
-    # While a checkpoint is being written there is one more.
-    required = num_checkpoints * sum(sizes) + max(sizes, default=0)
-    usage = shutil.disk_usage(folder)
-    # A virtual file system such as /proc has no size.
-    if usage.total and required > usage.free + written:
-        raise InputError(
-            f"out is in {folder.absolute()}, where {_in_words(usage.free)} are free: "
-            f"{num_checkpoints} checkpoints of each run, and one that is being "
-            f"written, need {_in_words(required)}"
         )
 
 

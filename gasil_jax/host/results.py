@@ -22,25 +22,20 @@ from gasil_jax.statistics import Estimate, estimate
 
 @dataclasses.dataclass(frozen=True)
 class Results:
-    """The results of all points and seeds.
-
-    Attributes:
-      sweep: the points and seeds.
-      trainings: how each program was trained.
-      metrics: every metric by name, (points, seeds, iterations) each.
-      evaluations: the columns of evaluations.csv, (points, seeds, evaluations) each;
-        empty without evaluations.
-      finals: the last columns of results.csv by their names, (points, seeds) each; NaN
-        in seeds in which no episode ended.
-      faults: "faulty_steps" (simulation) and "skipped_updates" (learning) over training
-        in which numbers were not finite, int (points, seeds) each.
-    """
+    """The results of all points and seeds."""
 
     sweep: Sweep
-    trainings: Sequence[Training]
+    trainings: Sequence[Training]  # how each program was trained
+    # Every metric by name, (points, seeds, iterations) each.
     metrics: dict[str, np.ndarray]
+    # The columns of evaluations.csv, (points, seeds, evaluations) each; empty without
+    # evaluations.
     evaluations: dict[str, np.ndarray]
+    # The last columns of results.csv by their names, (points, seeds) each; NaN in seeds
+    # in which no episode ended.
     finals: dict[str, np.ndarray]
+    # "faulty_steps" (simulation) and "skipped_updates" (learning) over training in
+    # which numbers were not finite, int (points, seeds) each.
     faults: dict[str, np.ndarray]
 
     @property
@@ -121,11 +116,7 @@ def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
 
 
 def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
-    """Write results.csv, curves.npz, the plots and summary.json; return the summary.
-
-    sweep.png and hyperparameters.png are of several points. policy.npz, which the
-    caller writes, has the policies of the best point by mean.
-    """
+    """Write results.csv, curves.npz, the plots and summary.json; return the summary."""
     sweep = results.sweep
     _write_results(folder / "results.csv", results)
     curves: dict[str, Any] = {**results.metrics}

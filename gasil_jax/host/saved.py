@@ -15,7 +15,7 @@ import numpy as np
 
 from gasil_envs import wrappers
 from gasil_envs.precision import full_precision
-from gasil_jax import numpy_policy, policy, train
+from gasil_jax import numpy_policy, policy, rollout, train
 from gasil_jax.agents.adversarial import AdversarialAgent
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Range
@@ -41,15 +41,8 @@ from gasil_jax.host.sweep import Sweep
 def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
     """Return the environment's and the agent's name, and the programs of a point.
 
-    The programs have the runs of that point alone. Only their tables can be read if
-    Python alone can make what was trained.
-
-    Args:
-      folder: folder of the run or sweep, which need not be finished.
-      point: number of the point; default the best by mean.
-
-    Raises:
-      InputError: if it is no such folder, or has no such point.
+    They have that point's runs alone. Only their tables can be read if Python alone can
+    make what was trained.
     """
     stored = sweep.described(folder)
     chosen = _choose_point(folder, stored["points"], point)
@@ -127,19 +120,8 @@ def load(
 ) -> tuple[Any, Algorithm, list[int], Any]:
     """Return environment, algorithm, seed numbers and states (seed, ...) of a point.
 
-    Args:
-      folder: folder of the run or sweep, which need not be finished.
-      which: the checkpoint to load: "last", or "best", which has the best evaluation
-        or, without evaluations, the highest returns in training.
-      point: number of the point; default the best by mean.
-      seed: number of the seed; default all seeds.
-      env: the environment; default that which config.json describes.
-      algorithm: the algorithm; default that which config.json describes.
-
-    Raises:
-      InputError: if it is not the folder of a run, if it has no such checkpoint or
-        seed, if the checkpoint is damaged, or if "best" is requested of a point that
-        shares its checkpoints with other points.
+    By default they are the best point by mean, all seeds, and the environment and the
+    algorithm that config.json describes; else see `load_policy`.
     """
     for name, number in (("point", point), ("seed", seed)):
         if number is not None and number not in Range(-math.inf, whole=True):
@@ -235,11 +217,7 @@ def states_of(
     point: int,
     trained: Sequence[tuple[Program, Outcome]],
 ) -> train.TrainState:
-    """Return the states of a point, (seeds, ...), as just trained or from its folder.
-
-    Raises:
-      InputError: as `load` does.
-    """
+    """Return the states of a point, (seeds, ...), just trained or from its folder."""
     runs = [stored.runs[point, seed] for seed in stored.seeds]
     for program, outcome in trained:
         if set(runs) <= set(program.runs):
@@ -251,18 +229,12 @@ def states_of(
 
 
 class Policies(NamedTuple):
-    """Saved policies.
+    """Saved policies."""
 
-    Attributes:
-      env: the environment that they were trained in.
-      num_steps: steps after which an episode is truncated, at the latest.
-      seeds: numbers of their seeds.
-      weights: the arrays of each, which `numpy_policy` describes.
-    """
-
-    env: Any
-    num_steps: int
-    seeds: Sequence[int]
+    env: Any  # the environment that they were trained in
+    num_steps: int  # steps after which an episode is truncated, at the latest
+    seeds: Sequence[int]  # numbers of their seeds
+    # The arrays of each, which `numpy_policy` describes.
     weights: Sequence[Mapping[str, np.ndarray]]
 
 
@@ -273,25 +245,14 @@ def load_policies(
     *,
     seed: int | None = None,
 ) -> Policies:
-    """Return the policies of a run, or one that comes with the package.
-
-    Args:
-      folder: folder of the run or sweep, or zoo:NAME, which has no points and no
-        checkpoints.
-      which: see `load`.
-      point: see `load`.
-      seed: see `load`.
-
-    Raises:
-      InputError: as `load` does, or if the zoo has no such policy.
-    """
+    """Return the policies of a run, as `load` does, or one of the package's own."""
     if not str(folder).startswith(numpy_policy.ZOO_PREFIX):
         env, _, seeds, states = load(pathlib.Path(folder), which, point, seed=seed)
         every = jax.device_get(policy.weights(states, env))
         names = [name for name in numpy_policy.SHARED if name in every]
         shared = {name: every.pop(name) for name in names}
         weights = [member(every, i) | shared for i in range(len(seeds))]
-        return Policies(env, train.max_episode_steps(env), seeds, weights)
+        return Policies(env, rollout.max_episode_steps(env), seeds, weights)
     if point is not None or which != "last":
         raise InputError(f"run is {folder}: it has no points and no checkpoints")
     arrays = numpy_policy.read(folder, seed)
@@ -322,13 +283,16 @@ def load_policy(
         the policies that come with the package. In a folder policy.npz is read if it
         has what is asked for, and a checkpoint otherwise.
       seed: number of the seed; default the one with the highest final return.
-      which: see `load`.
-      point: see `load`.
-      env: see `load`; only for checkpoints of an environment that was made in Python.
-      algorithm: see `load`; only for checkpoints of what was made in Python.
+      which: "last", or "best", the checkpoint with the best evaluation or, without
+        evaluations, the highest returns in training.
+      point: number of a sweep's point; default the best by mean.
+      env: the environment of a checkpoint, if it was made in Python.
+      algorithm: the algorithm of a checkpoint, if it was made in Python.
 
     Raises:
-      ValueError: if it is not a saved policy, or has no such seed; and as `load` does.
+      ValueError: if it is not a saved policy, if it has no such seed, point or
+        checkpoint, if that is damaged, or if "best" is asked of a point that shares its
+        checkpoints with others.
     """
     if not isinstance(path, str | pathlib.PurePath):
         raise refusal("path", path, "a string or a pathlib.Path")
@@ -361,14 +325,14 @@ def load_reward(
     Args:
       folder: folder of the run or sweep.
       seed: number of the seed; default the run's first.
-      which: see `load`.
-      point: see `load`.
-      env: see `load`; needed if the environment was made in Python.
-      algorithm: see `load`; needed if it was made in Python.
+      which: see `load_policy`.
+      point: see `load_policy`.
+      env: see `load_policy`.
+      algorithm: see `load_policy`.
 
     Raises:
-      ValueError: as `load` does, or if the run's agent has no discriminator, or a bonus
-        that depends on the batch that a step is in.
+      ValueError: as `load_policy` does, or if the run's agent has no discriminator, or
+        a bonus that depends on the batch that a step is in.
     """
     if not isinstance(folder, str | pathlib.PurePath):
         raise refusal("folder", folder, "a string or a pathlib.Path")

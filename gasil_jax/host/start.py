@@ -32,11 +32,7 @@ def find(folder: pathlib.Path) -> Start:
 
 
 def load(start: Start, env: Any, every: Sequence[Program]) -> Any:
-    """Return the trained state that programs start from; None if all have begun.
-
-    Raises:
-      InputError: if it is gone or has changed, or has networks of another form.
-    """
+    """Return the trained state that programs start from; None if all have begun."""
     if not (fresh := _without_checkpoint(every)):
         return None
     folder = pathlib.Path(start.run)

@@ -60,6 +60,9 @@ class Recording:
         by default none. The untrained policy is evaluated too. The scores are undelayed
         returns, in evaluations.csv.
       evaluate_episodes: episodes per seed in each evaluation.
+      video_every: environment steps per seed between two films of the first seed's
+        policy, rounded up to whole iterations; by default none. They are in videos/ and
+        where `log` logs.
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
@@ -67,52 +70,38 @@ class Recording:
     keep_checkpoints: int = 2
     evaluate_every: int | None = None
     evaluate_episodes: int = 10
+    video_every: int | None = None
     log: tuple[str, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True)
 class Start:
-    """The trained policy that runs start from.
+    """The trained policy that runs start from."""
 
-    Attributes:
-      run: the folder of its run.
-      seed: its seed.
-      sha256: hash of its checkpoint.
-    """
-
-    run: str
+    run: str  # the folder of its run
     seed: int
-    sha256: str
+    sha256: str  # hash of its checkpoint
 
 
 @dataclasses.dataclass(frozen=True)
 class Sweep:
-    """The points and seeds of a folder.
-
-    Attributes:
-      env: name of the environment.
-      algorithm: the algorithm that the points change.
-      others: those of further agents, which are trained beside it. Then each point has
-        its "agent".
-      start: the trained policy that all runs start from; None starts from scratch.
-      seeds: absolute seed numbers.
-      points: changed settings, by name; all have the same names.
-      settings: settings of the environment.
-      recording: what is recorded.
-      preset: name of the preset that the settings began with.
-      only_python: why no command line can make the environment or the algorithm again;
-        None if one can.
-    """
+    """The points and seeds of a folder."""
 
     env: str
-    algorithm: Algorithm
-    seeds: Sequence[int]
+    algorithm: Algorithm  # the algorithm that the points change
+    seeds: Sequence[int]  # absolute seed numbers
+    # Changed settings, by name; all have the same names.
     points: Sequence[Point] = ({},)
     settings: Settings = dataclasses.field(default_factory=Settings)
     recording: Recording = dataclasses.field(default_factory=Recording)
-    preset: str | None = None
+    preset: str | None = None  # name of the preset that the settings began with
+    # Why no command line can make the environment or the algorithm again; None if one
+    # can.
     only_python: str | None = None
+    # Those of further agents, which are trained beside it. Then each point has its
+    # "agent".
     others: Sequence[Algorithm] = ()
+    # The trained policy that all runs start from; None starts from scratch.
     start: Start | None = None
 
     @property
@@ -203,6 +192,17 @@ class Sweep:
         }
         json_files.write(folder / folders.CONFIG, content)
 
+    def begun_in(
+        self, folder: pathlib.Path, *, resume: bool, option: str = "out"
+    ) -> "Sweep":
+        """Write config.json, and return this sweep as `continued_from` does."""
+        with folders.lock(folder, option=option, seconds=60.0):
+            if not resume or not folders.has_config(folder):
+                folders.refuse_used(folder, option=option)
+            grown = self.continued_from(folder, option=option)
+            grown.write(folder)
+        return grown
+
     def continued_from(self, folder: pathlib.Path, *, option: str = "out") -> "Sweep":
         """Return this sweep with the points of the one in the folder before its own.
 
@@ -216,7 +216,7 @@ class Sweep:
             raise InputError(
                 f"{option} is {folder}, where {'; '.join(changed)}: only total_steps "
                 "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
-                "devices and log may differ"
+                "video_every, devices and log may differ"
             )
         every = points.completed([*stored["points"], *self.points], *self.algorithms)
         return dataclasses.replace(self, points=every, start=stored.get("start"))
@@ -256,10 +256,7 @@ def described(folder: pathlib.Path) -> Config:
 
 
 def read(folder: pathlib.Path, algorithm: Algorithm | None = None) -> Sweep:
-    """Return the sweep in a folder.
-
-    An algorithm that only Python can make is an argument.
-    """
+    """Return the sweep in a folder, with an algorithm that only Python can make."""
     return made(folder, described(folder), algorithm)
 
 

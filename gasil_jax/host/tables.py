@@ -140,13 +140,8 @@ def read(
 ) -> Columns:
     """Return every metric of a `TableWriter`'s file, (members, iterations) each.
 
-    A last iteration that is incomplete is left out, because training may be writing it.
-    The result is empty if no iteration is complete yet.
-
-    Args:
-      path: the file; an empty cell becomes NaN.
-      labels: columns that identify the members, (members,) each.
-      required: columns that it must have besides "env_steps".
+    An empty cell is NaN. A last iteration that is incomplete is left out, because
+    training may be writing it; without a complete one the result is empty.
     """
     num_members = len(labels["seed"])
     header: list[str] = []
@@ -197,10 +192,7 @@ def final_returns(returns: np.ndarray) -> np.ndarray:
 
 
 def finals(metrics: Columns, scores: Columns) -> dict[str, np.ndarray]:
-    """Return the final values of runs by name, (...), from columns (..., rows).
-
-    They are those of metrics.csv and, if there are any, of evaluations.csv.
-    """
+    """Return the final values of runs by name, (...), from columns (..., rows)."""
     values = {
         f"final_{name}": final_returns(metrics[f"episode_{name}"])
         for name in ("return", "length")

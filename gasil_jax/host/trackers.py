@@ -32,6 +32,9 @@ class Tracker(Protocol):
     def log(self, step: int, metrics: Mapping[str, np.ndarray]) -> None:
         """Log metrics of one iteration, (members,) each; NaN where there is none."""
 
+    def log_video(self, step: int, path: pathlib.Path) -> None:
+        """Log a film of the first member, a .gif."""
+
     def close(self) -> None:
         """Write everything that is still buffered, and close."""
 
@@ -56,6 +59,14 @@ class _TensorBoard:
                 for label, value in zip(self._labels, values, strict=True):
                     if np.isfinite(value):
                         self._writer.add_scalar(f"{name}/{label}", float(value), step)
+
+    def log_video(self, step: int, path: pathlib.Path) -> None:
+        from tensorboardX.proto.summary_pb2 import Summary
+
+        # `add_video` would need moviepy. TensorBoard plays a picture that is a film.
+        image = Summary.Image(colorspace=3, encoded_image_string=path.read_bytes())
+        value = Summary.Value(tag=f"video/{self._labels[0]}", image=image)
+        self._writer.file_writer.add_summary(Summary(value=[value]), step)
 
     def close(self) -> None:
         self._writer.close()
@@ -97,6 +108,11 @@ class _WeightsAndBiases:
             own = {name: float(values[index]) for name, values in metrics.items()}
             run.log({x: y for x, y in own.items() if np.isfinite(y)}, step=step)
 
+    def log_video(self, step: int, path: pathlib.Path) -> None:
+        import wandb
+
+        self._runs[0].log({"video": wandb.Video(str(path), format="gif")}, step=step)
+
     def close(self) -> None:
         for run in self._runs:
             run.finish()
@@ -135,10 +151,7 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 
 
 def check(names: Sequence[str]) -> None:
-    """Raise `ValueError` for a tracker that is unknown, not installed or named twice.
-
-    A note says if Weights & Biases will be offline.
-    """
+    """Raise `ValueError` for a tracker that is unknown, not installed or repeated."""
     for name in names:
         if names.count(name) > 1:
             raise ValueError(f"log has {name!r} twice: name it once")

@@ -7,8 +7,9 @@ from typing import Any
 import jax
 
 from gasil_envs import user_code
-from gasil_jax import checks, train
+from gasil_jax import checks, rollout, train
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.errors import InputError
 from gasil_jax.host import devices, driver, environments, resources, trackers
 from gasil_jax.host.driver import Callback, Outcome
 from gasil_jax.host.interruption import Interrupted, Interruption
@@ -29,24 +30,26 @@ def make_env(sweep: Sweep) -> Any:
 def prepare(
     sweep: Sweep,
     programs: Sequence[Program],
-    folder: pathlib.Path,
     *,
     num_devices: int | None = None,
 ) -> Any:
-    """Start the devices, check that everything works and fits; return the environment.
-
-    Nothing is compiled before this is done.
-    """
+    """Start the devices, check that all works and fits, and return the environment."""
     num_members = sum(len(each.runs) for each in programs)
     devices.use_devices(sweep.settings, num_devices, num_members)
     env = make_env(sweep)
+    every = sweep.recording.video_every
+    if every is not None and not environments.can_be_drawn(env):
+        raise InputError(
+            f"video_every is {every}: {sweep.env} must have a function "
+            "draw(state, size), because nothing else can draw it"
+        )
     with announced(sweep.env, "starting the devices"):
-        every = jax.devices()
+        visible = jax.devices()
     algorithms = {x.algorithm.agent.name: x.algorithm for x in programs}
     for each in algorithms.values():
         _check(env, each)
     with announced(sweep.env, "tracing the first state"):
-        resources.check(env, programs, sweep.recording, every, folder)
+        resources.check(env, programs, sweep.recording, visible)
     if num_devices is not None and 0 < num_members < num_devices:
         note(
             f"devices is {num_devices}, of which {num_members} are used, one for each "
@@ -78,7 +81,7 @@ def _note_if_no_episode_ends(env: Any, every: Sequence[Algorithm]) -> None:
     """Print a note if no episode can end within the steps of an environment."""
     for config in (algorithm.config for algorithm in every):
         steps = config.num_iterations * config.num_steps
-        limit = train.max_episode_steps(env)
+        limit = rollout.max_episode_steps(env)
         if steps < limit and not environments.ends_early(env):
             note(
                 f"no episode can end, so no return is known: each of {config.num_envs} "

@@ -29,13 +29,13 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax import learner, normalization
-from gasil_jax.buffer import History, write
 from gasil_jax.config import count, number, widths
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.learner import Learner
 from gasil_jax.networks import StepReward
 from gasil_jax.normalization import Normalizer
 from gasil_jax.rewards.interface import RewardModel
+from gasil_jax.rollout import History, write
 
 # Largest count of float32 numbers in a part of a minibatch: 2 MB, which fits a CPU's
 # cache.

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gasil_jax import buffer as good_trajectories
+from gasil_jax import rollout
 
 CAPACITY, NUM_ENVS, NUM_STEPS, MAX_EPISODE = 7, 2, 3, 5
 
@@ -44,7 +45,7 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
         faulty=False,
         cut_short=False,
     )
-    history = good_trajectories.record(history, batch)
+    history = rollout.record(history, batch)
     buffer = good_trajectories.insert(
         buffer, history, ended, return_, length=length, max_episodes=max_episodes
     )
@@ -54,7 +55,7 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
 def empty():
     return (
         good_trajectories.init_buffer(CAPACITY, 1, 1),
-        good_trajectories.init_history(
+        rollout.init_history(
             NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=1, action_size=1
         ),
     )
@@ -152,9 +153,9 @@ def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
 
     def record(history, observation):
         steps.observation, steps.next_observation = observation, observation + 1
-        return good_trajectories.record(history, steps)
+        return rollout.record(history, steps)
 
-    history = good_trajectories.init_history(
+    history = rollout.init_history(
         1, 2, 2, observation_size=1, action_size=1, keep_next=True
     )
     assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
@@ -163,5 +164,5 @@ def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
         history = record(history, observation)
     assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
     assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
-    history = good_trajectories.init_history(1, 2, 2, observation_size=1, action_size=1)
+    history = rollout.init_history(1, 2, 2, observation_size=1, action_size=1)
     assert record(history, observation).next_observation is None

@@ -164,9 +164,9 @@ def test_a_picture_that_is_none_is_refused(finished, tmp_path, monkeypatch, caps
 @pytest.mark.parametrize(
     ("env", "action", "message"),
     [
-        ("corridor:Corridor", [0, 3], r"actions from 0 to 3: .* whole numbers .* to 2"),
-        ("corridor:Corridor", [0, 1.5], "actions from 0 to 1.5"),
-        ("point_mass", [0, 1], "numbers as actions: .* vectors of size 2"),
+        ("corridor:Corridor", [0, 3], r"0 to 3 as actions: .* whole numbers .* to 2"),
+        ("corridor:Corridor", [0, 1.5], "from 0 to 1.5 as actions"),
+        ("point_mass", [0, 1], "as actions: .* vectors of size 2"),
     ],
 )
 def test_an_expert_with_other_actions_is_refused(env, action, message, tmp_path):

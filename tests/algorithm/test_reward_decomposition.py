@@ -9,8 +9,7 @@ import pytest
 from test_train import SMALL
 
 import gasil_jax
-from gasil_jax import buffer as good_trajectories
-from gasil_jax import normalization
+from gasil_jax import normalization, rollout
 from gasil_jax.context import Context, Sizes
 from gasil_jax.distributions import GAUSSIAN
 from gasil_jax.rewards import decomposition
@@ -37,7 +36,7 @@ def windows_of(history):
 
 def new_history(num_envs=NUM_ENVS, **more):
     sizes = {"observation_size": OBS, "action_size": ACT, "keep_next": True}
-    return good_trajectories.init_history(num_envs, NUM_STEPS, LIMIT, **sizes, **more)
+    return rollout.init_history(num_envs, NUM_STEPS, LIMIT, **sizes, **more)
 
 
 def random_batches(seed, num_batches, delay=5):
@@ -80,7 +79,7 @@ def random_batches(seed, num_batches, delay=5):
 
 @jax.jit
 def decompose_once(state, history, batch, key, learning_rate):
-    history = good_trajectories.record(history, batch)
+    history = rollout.record(history, batch)
     context = Context(
         rollout=batch,
         history=history,
@@ -130,7 +129,7 @@ def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, comp
             faulty=False,
             cut_short=False,
         )
-        history = good_trajectories.record(history, steps)
+        history = rollout.record(history, steps)
         windows = windows_of(history)
         most = max(most, int(windows.ends.sum()))
         assert (windows.length[windows.ends] == LIMIT).all()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from gasil_jax.agents import self_imitation
-from gasil_jax.buffer import init_history, record
+from gasil_jax.rollout import init_history, record
 
 GAMMA = 0.9
 

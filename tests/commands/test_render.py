@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gasil_jax import policy
 from gasil_jax.cli import render
-from gasil_jax.host import saved
+from gasil_jax.host import saved, video
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -80,7 +79,7 @@ def test_a_film_is_whole_or_not_there(trained, tmp_path, monkeypatch, capsys):
         path.write_bytes(b"x")
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(render, "write_film", half)
+    monkeypatch.setattr(video, "write_film", half)
     path = tmp_path / "film.gif"
     assert render.main([str(trained.folder), "--out", str(path), "--steps", "2"]) == 1
     assert "No space left on device" in capsys.readouterr().err
@@ -89,7 +88,6 @@ def test_a_film_is_whole_or_not_there(trained, tmp_path, monkeypatch, capsys):
 
 def test_an_episode_ends_before_the_physics_fails(trained):
     policies = saved.load_policies(trained.folder)
-    act = policy.make(policies.weights[0])
     env = policies.env
 
     class Failing(type(env)):
@@ -108,16 +106,17 @@ def test_an_episode_ends_before_the_physics_fails(trained):
             blow_up = lambda x: jax.numpy.where(fails, jax.numpy.nan, x)
             return stepped.replace(obs=blow_up(stepped.obs), reward=blow_up(1.0))
 
-    states, total = render.episode(Failing(), act, jax.random.key(0), num_steps=20)
+    run = video.make_episode(Failing(), num_steps=20)
+    states, total = run(policies.weights[0], jax.random.key(0))
     assert len(states) == 4 and total == 3.0
 
 
 def test_without_a_display_and_egl_nothing_is_drawn_by_opengl():
-    # It is decided before what takes seconds to import, MuJoCo among it.
+    # It is decided before MuJoCo is imported, which reads it once.
     code = """
 import ctypes.util, os, sys
 ctypes.util.find_library = lambda name: None
-sys.modules["jax"] = sys.modules["mujoco"] = None
+sys.modules["mujoco"] = None
 try:
     import gasil_jax.render
 except ImportError:

@@ -265,6 +265,7 @@ gymnax:CartPole-v1 --preset gymnax |
 walker2d --agent ppo+bc --preset paper |
 walker2d --agent ppo --reward-delay 20 |
 walker2d --agent ppo --preset scaled --reward-delay 20 |
+sparse:u_maze --agent ppo+gasil+novelty |
 """
 
 
@@ -281,7 +282,7 @@ def test_more_devices_than_seeds_are_told(capsys, monkeypatch):
     monkeypatch.setattr(training.resources, "check", lambda *_: None)
     _, requested = options_.read(Options, ["--env", "point_mass", "--seeds", "2"], "x")
     programs = requested.unfinished(training.driver.pathlib.Path("/dev/null"))
-    training.prepare(requested, programs, None, num_devices=8)
+    training.prepare(requested, programs, num_devices=8)
     assert "devices is 8, of which 2 are used" in notes(capsys)[-1]
 
 

@@ -11,7 +11,7 @@ from environment_contract import check_reset_and_step
 
 import gasil_envs
 from gasil_envs import pictures, worlds, wrappers
-from gasil_jax.cli import render
+from gasil_jax.host import video
 
 gymnax = pytest.importorskip("gymnax")
 from gymnax.environments import environment, spaces  # noqa: E402
@@ -224,7 +224,7 @@ def test_what_draws_itself_is_drawn():
     step = lambda state: env.step(state, jnp.int32(1))
     states = [env.reset(jax.random.key(0))]
     states.append(step(states[0]))
-    frames, _ = render.frames_of(env, [x.pipeline_state for x in states], (160, 120))
+    frames, _ = video.frames_of(env, [x.pipeline_state for x in states], (160, 120))
     assert frames[0].shape == (120, 160, 3) and (frames[0] != frames[1]).any()
 
 

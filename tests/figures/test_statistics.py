@@ -67,15 +67,3 @@ def test_the_profile_counts():
     scores, levels = np.array([1.0, 2.0, 3.0, 4.0]), np.array([0.0, 2.0, 3.5, 9.0])
     profile = statistics.performance_profile(scores, levels)
     np.testing.assert_array_equal(profile, [1.0, 0.5, 0.25, 0.0])
-
-
-def test_groups():
-    groups = lambda values: [list(x) for x in statistics.groups(values)]
-    assert groups([]) == []
-    assert groups([2.0, 1.0, 2.0]) == [[1], [0, 2]]
-    assert groups(["b", "a", "b", None]) == [[0, 2], [1], [3]]
-    assert groups([True, False, True]) == [[0, 2], [1]]
-    # Numbers in reverse order, three neighbours in a group; the same are never apart.
-    assert groups(list(range(9, 0, -1))) == [[6, 7, 8], [3, 4, 5], [0, 1, 2]]
-    assert groups([1, 1, 2, 3, 4, 5, 6, 6]) == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    assert len(groups(list(range(100)))) == 8

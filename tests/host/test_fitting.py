@@ -124,7 +124,7 @@ def test_it_stops_early_and_goes_on(env, commanded, tmp_path, capsys):
     root = program_of(out) / "checkpoints"
     assert checkpoint.latest(root)[0].iteration == 50
 
-    with pytest.raises(ValueError, match=r"folder is .*: give resume=True"):
+    with pytest.raises(ValueError, match=r"folder is .* with resume=True"):
         gasil_jax.fit(env, PPO, **arguments)
     for changed, why in (
         (PPO.replace(gamma=0.9), r"gamma was 0.99, is 0.9; .*evaluate_every was 5120"),

@@ -81,6 +81,7 @@ SETTINGS = {
     "learning_rate_schedule": [((1, 0.5), (0, 1)), ((0, -1),), lambda: 1.0],
     "normalize_rewards": [None, 1, "on", np.True_],
     "minibatch_size": [60],
+    "bonus": NUMBERS,
 }
 ENVIRONMENT = {
     "reward_delay": [*NUMBERS, 0, 0.5],

@@ -29,6 +29,15 @@ def test_a_slow_phase_is_announced_in_one_line(monkeypatch, capsys):
         raise OSError("full")
 
 
+def test_a_long_phase_says_for_how_long_it_has(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_ANNOUNCEMENTS", 0.01)
+    with progress.Progress("hopper", 100).aside("compiling", at_once=True):
+        deadline, text = time.monotonic() + 20.0, ""
+        while text.count("\n") < 2 and time.monotonic() < deadline:
+            text += wait_for_text(capsys)
+    assert text.startswith("hopper: compiling\nhopper: compiling (0 s)\n")
+
+
 def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
     monkeypatch.setattr(progress, "_SECONDS_BEFORE_ANNOUNCEMENT", 600.0)
     before = threading.active_count()
@@ -77,9 +86,9 @@ def test_at_80_columns_only_the_bar_gives_way(monkeypatch):
     monkeypatch.setattr(progress, "Console", lambda stderr: console())
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
     with progress.Progress("halfcheetah ppo+gasil sweep", 10**9, 100) as bar:
-        bar.phase("compiling")
-        clock[0] += 65.0
-        bar._bar.refresh()
+        with bar.aside("compiling"):
+            clock[0] += 65.0
+            bar._bar.refresh()
         assert "compiling (65 s)" in shown.getvalue()
         bar.phase("training")
         clock[0] += 1000.0

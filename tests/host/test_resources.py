@@ -1,8 +1,6 @@
-"""Memory and disk are estimated before a run; memory during one: test_resume.py."""
+"""Memory is estimated before a run; memory during one: test_resume.py."""
 
 import re
-import shutil
-from unittest import mock
 
 import jax
 import numpy as np
@@ -15,7 +13,6 @@ from gasil_jax import config, run
 from gasil_jax.errors import InputError
 from gasil_jax.host import environments, resources
 from gasil_jax.host.members import make_members
-from gasil_jax.host.programs import Program
 
 
 @pytest.mark.parametrize(
@@ -44,28 +41,11 @@ def test_the_estimate_is_within_a_factor_of_two(agent, changes):
     assert 0.5 < 3 * resources.need(env, algorithm).memory / total < 2.0
 
 
-def full(monkeypatch, free):
-    """Leave these bytes on every disk."""
-    usage = mock.Mock(total=10**12, free=free)
-    monkeypatch.setattr(shutil, "disk_usage", lambda folder: usage)
-
-
 def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, capsys):
     arguments = [*FLAGS, "--seeds", "3", "--out", str(tmp_path / "out")]
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
     assert "a single seed needs about" in refused(capsys, run, *arguments)
-
-    monkeypatch.setattr(resources, "available", lambda devices: None)
-    full(monkeypatch, 10_000)
-    told = refused(capsys, run, *arguments)
-    assert "3 checkpoints of each run, and one that is being written" in told
     assert not (tmp_path / "out").exists()
-
-    # Those of all points stay on the disk.
-    full(monkeypatch, 9000)
-    resources._check_disk([2000], tmp_path, 3, [])
-    with pytest.raises(ValueError, match=r"need 0\.01 MB"):
-        resources._check_disk([2000, 2000], tmp_path, 3, [])
 
 
 @pytest.mark.parametrize(
@@ -106,23 +86,6 @@ def test_any_count_that_shapes_a_large_array_is_refused_before_compiling(monkeyp
     )
     with pytest.raises(InputError, match=told):
         make_members(env, algorithm, [0]).compile()
-
-
-def test_the_checkpoints_of_a_run_to_be_continued_make_room(tmp_path, monkeypatch):
-    state = 1000
-    full(monkeypatch, state)
-    with pytest.raises(ValueError, match="3 checkpoints of each run"):
-        resources._check_disk([state], tmp_path / "new", 3, [])
-    for name in ("10", "20", "30", "40.damaged"):
-        folder = tmp_path / "checkpoints" / name / "state"
-        folder.mkdir(parents=True)
-        (folder / "array").write_bytes(bytes(state))
-    resources._check_disk([state], tmp_path, 3, [Program((), tmp_path)])
-    with pytest.raises(ValueError, match="4 checkpoints of each run"):
-        resources._check_disk([state], tmp_path, 4, [Program((), tmp_path)])
-    # The checkpoints of folders below do not count.
-    with pytest.raises(ValueError, match="3 checkpoints of each run"):
-        resources._check_disk([state], tmp_path, 3, [Program((), tmp_path.parent)])
 
 
 def test_a_container_has_what_others_in_it_leave(tmp_path):
@@ -168,7 +131,7 @@ def test_members_have_equal_shares_of_the_devices_that_are_used():
     assert resources.available(devices[1:2]) == 90_000
     algorithm = gasil_jax.algorithm()
     fits = lambda size, count: resources.check_memory(
-        resources.Need(0, size, "networks"), algorithm, count, devices
+        resources.Need(size, "networks"), algorithm, count, devices
     )
     fits(80_000, 8)
     fits(40_000, 16)

@@ -6,9 +6,11 @@ import types
 
 import numpy as np
 import pytest
+from PIL import Image
 from refusals import refused
 from small_training import FLAGS
 
+from gasil_envs import pictures
 from gasil_jax import run, sweep
 from gasil_jax.errors import InputError
 from gasil_jax.host import trackers
@@ -56,26 +58,45 @@ def test_each_member_is_a_run_in_wandb(tmp_path, monkeypatch):
         ["wandb"], tmp_path, run_name="alpha", config={"alpha": 1.0}, members=MEMBERS
     )
     trackers.log([tracker], METRICS)
+    wandb.Video = lambda path, format: (path, format)
+    tracker.log_video(20, tmp_path / "00000020.gif")
     (first, logged), (second, _) = runs["alpha-0-5"], runs["alpha-1-5"]
     assert first["group"] == second["group"] == "alpha" and first["id"] != second["id"]
     assert second["config"] == {"alpha": 0.2, "seed": 5}
     assert logged == [
         ("log", {"episode_return": 1.0}, ("step", 10)),
         ("log", {"episode_return": 2.0, "entropy": 1.0}, ("step", 20)),
+        ("log", {"video": (str(tmp_path / "00000020.gif"), "gif")}, ("step", 20)),
     ]
 
 
-def test_a_run_in_tensorboard(tmp_path):
+def test_a_run_in_tensorboard_with_films(tmp_path, monkeypatch, capsys):
     pytest.importorskip("tensorboardX")
-    out = tmp_path / "out"
-    more = ("--no-stagger-episodes", "--log", "tensorboard", "--out", str(out))
-    assert run.main([*SMALL, *more]) == 0
+    out, plain = tmp_path / "out", tmp_path / "plain"
+    small = (*SMALL, "--no-stagger-episodes", "--video-every", "100")
+    more = ("--log", "tensorboard", "--out", str(out))
+    assert run.main([*small, *more]) == 0
+    films = [*out.glob("programs/*/videos/*")]
+    assert sorted(x.name for x in films) == ["00000128.gif", "00000256.gif"]
+    assert all(Image.open(x).size == (320, 240) for x in films)
+
+    # Without OpenGL training goes on, and films do not change its numbers.
+    def painter(env, size):
+        raise pictures.NoOpenGL("no OpenGL here")
+
+    monkeypatch.setattr(pictures, "painter", painter)
+    capsys.readouterr()
+    assert run.main([*small, "--out", str(plain)]) == 0
+    assert capsys.readouterr().err.count("warning: no videos are made: no OpenGL") == 1
+    one, other = (next(x.glob("programs/*/metrics.csv")) for x in (out, plain))
+    assert one.read_bytes() == other.read_bytes()
     (path,) = out.glob("programs/*/tensorboard/*")
     content = path.read_bytes()
     assert content.count(b"mean/policy_loss") == 2
     # Episodes of 50 steps end in the second iteration.
     for name in (b"mean/episode_return", b"episode_return/0-3", b"episode_return/0-4"):
         assert content.count(name) == 1
+    assert content.count(b"GIF89a") == content.count(b"video/0-3") == 2
 
 
 @pytest.mark.slow
