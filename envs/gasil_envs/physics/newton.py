@@ -245,6 +245,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
     each = jax.tree.map
     # A row that bends twice can send a search from one end to the other for ever.
     pulls = any(most is not None for most in system.bound)
+    thorough = pulls or line_search > 4
 
     def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
         """Return a function of each row; `others` are the last arguments."""
@@ -305,8 +306,9 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
                 inside &= jnp.abs(following - other_end) > 0.01 * (high - low)
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
-            # Newton's step within one piece is the last; half of the way is none.
-            goes_on = system.differ((before, is_newton), (now, is_newton | True))
+            goes_on = system.differ(before, now)
+            if thorough:  # Half of the way is no step to end with.
+                goes_on |= system.differ(is_newton, is_newton | True)
             return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
