@@ -10,7 +10,6 @@ from experiments.agents import AGENTS
 from experiments.search import (
     DELAY,
     PAPERS,
-    SPARSE_GRIDS,
     SPARSE_ROBOTS,
     Point,
     Search,
@@ -173,7 +172,10 @@ class Figure:
                 delayed, raw, _ = next(iter(self.panels[panel].values())).family
                 return {"delayed" if delayed else "dense", *["raw"] * raw}
             task = panel.removesuffix("_noisy")
-            kinds = {"robots": task in SPARSE_ROBOTS, "navix": task in SPARSE_GRIDS}
+            kinds = {
+                "robots": task in SPARSE_ROBOTS,
+                "navix": task.startswith("navix:"),
+            }
             kinds["noisy"] = task != panel
             return {x for x, holds in kinds.items() if holds}
 

@@ -237,7 +237,7 @@ class Results:
         """
         if self.is_of_one_task:
             return [
-                Row(_in_words(*key), one, {}) for key, one in self.comparisons.items()
+                Row(row_name(*key), one, {}) for key, one in self.comparisons.items()
             ]
         test: Any = comparisons.improvement
         if self.figure.solved_from is not None:
@@ -258,7 +258,7 @@ class Results:
         every = comparisons.judged(effects, self.figure.dropped_pairs)
         return [
             Row(
-                _in_words("", *pair),
+                row_name("", *pair),
                 one,
                 {x: self.comparisons[x, *pair].verdict for x in pairs[pair]},
             )
@@ -266,7 +266,7 @@ class Results:
         ]
 
 
-def _in_words(panel: str, ours: str, other: str, less: str = "") -> str:
+def row_name(panel: str, ours: str, other: str, less: str = "") -> str:
     """Return what a comparison compares."""
     before = f"{panel}: " if panel else ""
     return f"{before}{ours} − {other}" + (f", less {less}'s" if less else "")

@@ -571,6 +571,56 @@ def _with_exploration(env: str) -> Panels:
     )
 
 
+#: One agent with one rule for all tasks, the agent without each of its parts, and PPO
+#: and PPO+NOVELTY with the same rule.
+_ONE = "ppo+gasil+novelty"
+_ONE_ARMS = [
+    Arm(_ONE, _ONE),
+    Arm("without imitation", _ONE, {"alpha": 0.0}),
+    Arm("without novelty", _ONE, {"novelty_coefficient": 0.0}),
+    Arm("ppo", "ppo"),
+    Arm("ppo+novelty", "ppo+novelty"),
+]
+_ONE_DELAYED = [
+    *_ONE_ARMS,
+    Arm("without decomposition", _ONE, {"decompose_rewards": False}),
+]
+_GYMNAX = [
+    f"gymnax:{name}"
+    for name in (
+        *("CartPole-v1", "Acrobot-v1", "MountainCar-v0", "Catch-bsuite"),
+        *(f"{x}-MinAtar" for x in ("Breakout", "Asterix", "SpaceInvaders", "Freeway")),
+    )
+]
+_DOOR_KEYS = [f"navix:Navix-DoorKey-{size}-v0" for size in ("5x5", "6x6", "8x8")]
+
+
+def _one_agent(
+    tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
+) -> Panels:
+    """Return the one agent and what it is compared with, all with the rule `scaled`.
+
+    No search and no other figure has its seeds.
+    """
+    # Other tasks than robots have two dimensions, fewer, or discrete actions.
+    sizes = presets.ACTION_SIZES
+    robots = {env: env.removeprefix("sparse:").removesuffix("_noisy") for env in tasks}
+    return joined(
+        grid(
+            (env,),
+            _ONE_DELAYED if delay > 1 else _ONE_ARMS,
+            (delay,),
+            base=None,
+            changes=presets.scaled(sizes.get(robot, 2), decompose_rewards=delay > 1),
+            seeds=20,
+            first_seed=100,
+            total_steps=total_steps,
+        )
+        for env, robot in robots.items()
+        for delay in delays
+    )
+
+
 FIGURES: Mapping[str, Figure] = {
     "point_mass": Figure(
         "2D point mass (paper, figures 2 to 4)",
@@ -843,6 +893,31 @@ FIGURES: Mapping[str, Figure] = {
             total_steps=SPARSE_STEPS,
         ),
         pairs=[(f"{x} (raw)", x) for x in SPARSE_SPACES],
+        solved_from=solved_from,
+    ),
+    "one_agent": Figure(
+        "One agent with one rule for all tasks: dense and delayed rewards",
+        "",
+        joined(
+            [
+                _one_agent(TASKS, (1, DELAY, 100)),
+                _one_agent(["point_mass", *_GYMNAX]),
+            ]
+        ),
+        favourite=_ONE,
+        shown=[arm.name for arm in _ONE_ARMS],
+    ),
+    "one_agent_sparse": Figure(
+        "One agent with one rule for all tasks: sparse rewards",
+        "",
+        joined(
+            [
+                _one_agent([*SPARSE, *_NOISY], total_steps=SPARSE_STEPS),
+                _one_agent([*_ROBOTS, *_DOOR_KEYS]),
+            ]
+        ),
+        favourite=_ONE,
+        shown=[arm.name for arm in _ONE_ARMS],
         solved_from=solved_from,
     ),
 }

@@ -404,7 +404,7 @@ class SparseSearch(SingleStage):
 @functools.cache
 def solved_from(env: str) -> float:
     """Return the return from which on a sparse task is solved."""
-    if env in SPARSE_GRIDS:
+    if env.startswith("navix:"):
         # They pay 1 for a success, and their package may be missing.
         return 1.0
     return make_env(env).unwrapped.solved

@@ -14,7 +14,7 @@ import numpy as np
 from experiments import doing_nothing
 from experiments.comparisons import BELOW, in_words, number
 from experiments.curves import Curve, name_of
-from experiments.figure_results import Results, Row
+from experiments.figure_results import Results, Row, row_name
 from experiments.search import AGENTS, BEYOND, DELAY, SPACES, TASKS
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, unknown
@@ -196,6 +196,20 @@ def count(results: Results, verdict: str, kind: str, ours: str, *others: str) ->
     return f"{len(holds)} of {len(measured)}"
 
 
+def likely(results: Results, ours: str, other: str) -> str:
+    """Return how likely a seed of ours returns more than one of the other curve.
+
+    It is the row of the forest plot, and its verdict; empty without the curves' runs.
+    """
+    if not any(key[1:] == (ours, other) for key in results.figure.compared()):
+        raise InputError(f"likely has {ours}, {other}: not compared")
+    compared = {row.name: row.compared for row in results.forest()}
+    if (one := compared.get(row_name("", ours, other))) is None:
+        return ""
+    words = in_words(0.5 + one.middle, 0.5 + one.low, 0.5 + one.high, ".2f")
+    return f"{words}, {one.verdict}"
+
+
 def below(results: Results, kind: str = "") -> str:
     """Return the tasks on which some curves both return less than doing nothing."""
     panels = results.figure.of_kind(kind)
@@ -291,7 +305,7 @@ def share(results: Results, kind: str, name: str) -> str:
 SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        *(claim, curves, forest, numbers, final, search, apart, count, below),
+        *(claim, curves, forest, numbers, final, search, apart, count, likely, below),
         *(foretold, passing, published, grids, share),
     )
 }

@@ -9,6 +9,7 @@ from .agents import PPOSIL as PPOSIL
 from .agents import Agent as Agent
 from .agents import PPOBCNovelty as PPOBCNovelty
 from .agents import PPOGASILAdaptive as PPOGASILAdaptive
+from .agents import PPOGASILNovelty as PPOGASILNovelty
 from .agents import PPONovelty as PPONovelty
 from .algorithms import Algorithm as Algorithm
 from .algorithms import algorithm as algorithm

@@ -8,7 +8,10 @@ and the normalization of rewards that it ran with; alpha suits only that normali
 Which rows are from which search is in docs/running.md. An agent without a row for a
 task starts from the defaults.
 
-"scaled" has one rule of PPO for all tasks; it decomposes delayed rewards.
+"scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
+learning rate, exploration and lambda depend on the dimension of an action, which counts
+as two where actions are discrete. Delayed rewards are decomposed. "tuned" has this rule
+for PPO+GASIL+NOVELTY too.
 
 "gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
 for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
@@ -57,6 +60,10 @@ ACTION_SIZES = {
     "reacher": 2,
     "pusher": 7,
 }
+#: The agents that follow the rule "scaled", in any environment; by default the last.
+RULED = ("ppo", "ppo+novelty", "ppo+gasil+novelty")
+#: The dimension that discrete actions count as, in that rule.
+DISCRETE_SIZE = 2
 # One setting of adaptive imitation for every task, chosen on two seeds a task with
 # rewards delayed by 20 steps (experiments/notes/adaptive_ablation.md).
 _ADAPTIVE = {
@@ -95,7 +102,7 @@ def _searched(rewards: str, adaptive: Overrides | None = None) -> Rows:
 
 
 def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
-    """Return settings of PPO that depend on the dimension of an action.
+    """Return settings that depend on the dimension of an action.
 
     They fall linearly from two dimensions to eight, and are the same for more
     (docs/results/ablations.md): with more dimensions the searches chose a smaller
@@ -119,9 +126,15 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
 
 def _scaled(decompose_rewards: bool) -> Rows:
     return {
-        (env, "ppo"): scaled(size, decompose_rewards)
+        (env, agent): scaled(size, decompose_rewards)
+        for agent in RULED
         for env, size in ACTION_SIZES.items()
     }
+
+
+def is_ruled(agent: str, name: str) -> bool:
+    """Return whether a preset has the rule "scaled" for an agent."""
+    return agent in RULED if name == "scaled" else (name, agent) == (DEFAULT, RULED[-1])
 
 
 class Preset(NamedTuple):
@@ -182,8 +195,8 @@ def preset(
       agent: name of the agent, or its class.
       name: name of the preset, one of `names()`.
       reward_delay: the environment's reward delay, in steps.
-      action_size: dimension of an action, which "scaled" needs for an environment that
-        is no locomotion task of ours.
+      action_size: dimension of an action, `DISCRETE_SIZE` if actions are discrete. The
+        rule "scaled" needs it for an environment that is no locomotion task of ours.
 
     Returns:
       The defaults, overridden by what the preset has for all tasks and by its row. If
@@ -205,16 +218,17 @@ def preset(
     ours, others = ("point_mass", *ACTION_SIZES), (*worlds.forms(), "MODULE:NAME")
     if not isinstance(env, str) or (env not in ours and ":" not in env):
         raise ValueError(unknown("env", env, ours, forms=others))
-    if name == "scaled" and kind.name == "ppo" and action_size is not None:
-        row = scaled(action_size, decompose_rewards=reward_delay > 1)
+    if is_ruled(kind.name, name):
+        size = ACTION_SIZES.get(env) if action_size is None else action_size
+        if size is None:
+            raise ValueError(
+                f"action_size is None: preset {name!r} needs the dimension of {env}'s "
+                "actions, which is env.action_size, or 2 if they are discrete"
+            )
+        row = scaled(size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
     rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
-    if lacking is not None and (name, kind.name) == ("scaled", "ppo"):
-        raise ValueError(
-            f"action_size is None: preset 'scaled' needs the dimension of {env}'s "
-            "actions, which is env.action_size"
-        )
     if lacking is not None and name != DEFAULT:
         tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
         raise ValueError(f"{lacking}: it has {agents} on {tasks}")
@@ -224,7 +238,8 @@ def preset(
 
 def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str | None:
     """Return in words that a preset has nothing for an agent on a task, or None."""
-    if PRESETS[name].every or (env, agent) in _rows(name, reward_delay):
+    rows = _rows(name, reward_delay)
+    if PRESETS[name].every or is_ruled(agent, name) or (env, agent) in rows:
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"
     return (

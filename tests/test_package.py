@@ -64,7 +64,7 @@ def test_help_imports_nothing_that_only_training_needs():
     result = subprocess.run(
         [sys.executable, "-c", imported], check=True, capture_output=True, text=True
     )
-    slow = "brax gymnasium matplotlib mujoco warp"
+    slow = "brax gymnasium matplotlib mujoco orbax warp"
     assert not set(slow.split()) & set(result.stdout.split())
 
 

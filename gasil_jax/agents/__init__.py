@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from gasil_jax.agents.adaptive import PPOGASILAdaptive
 from gasil_jax.agents.adversarial import GAIL, GASIL, PPOGASIL
 from gasil_jax.agents.behavior_cloning import PPOBC
+from gasil_jax.agents.gasil_novelty import PPOGASILNovelty
 from gasil_jax.agents.interface import Agent
 from gasil_jax.agents.novelty import PPOBCNovelty, PPONovelty
 from gasil_jax.agents.ppo import PPO
@@ -27,6 +28,7 @@ AGENTS: Mapping[str, type[Agent]] = {
         GASIL,
         PPOGASIL,
         PPOGASILAdaptive,
+        PPOGASILNovelty,
         GAIL,
     )
 }
@@ -48,6 +50,7 @@ __all__ = [
     "Agent",
     "PPOBCNovelty",
     "PPOGASILAdaptive",
+    "PPOGASILNovelty",
     "PPONovelty",
     "agents_with",
 ]

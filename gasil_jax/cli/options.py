@@ -55,12 +55,12 @@ class Options:
         gymnax:CartPole-v1; a sparse task as sparse:NAME; or your own as MODULE:NAME.
         --list-envs prints all names.
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
-        ppo+novelty, ppo+bc+novelty, gail, or your own as MODULE:CLASS. Each has its own
-        settings: this help shows those of the one that is named beside it. Several,
-        separated by commas, are trained side by side, each from its own preset: the
-        points of a sweep.
+        ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
+        MODULE:CLASS. Each has its own settings: this help shows those of the one that
+        is named beside it. Several, separated by commas, are trained side by side, each
+        from its own preset: the points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
-        agent; scaled, one rule of PPO for all continuous tasks; gymnax, one setting for
+        agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
         seed. Options override them. The defaults that this help shows are the preset's
         if --env is named beside --help.
@@ -284,7 +284,7 @@ def _default(name: str, first: argparse.Namespace) -> Algorithm:
             agent,
             preset,
             reward_delay=first.reward_delay,
-            action_size=_action_size(first.env, preset),
+            action_size=_action_size(first.env, agent.name, preset),
         )
     models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
     algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
@@ -305,18 +305,15 @@ def _switches(algorithm: Algorithm) -> dict[str, Any]:
     return {x.switch: algorithm.settings[x.switch] for x in REWARD_MODELS}
 
 
-def _action_size(env: str, preset: str) -> int | None:
+def _action_size(env: str, agent: str, preset: str) -> int | None:
     """Return the dimension of an action, if a preset needs it for an environment."""
-    if preset != "scaled" or env in presets.ACTION_SIZES:
+    if not presets.is_ruled(agent, preset) or env in presets.ACTION_SIZES:
         return None
     # The environment's arrays start JAX.
     devices.use_devices(Settings(), None, environments.available_cores())
     built = environments.make_env(env)
     if environments.is_discrete(built):
-        raise InputError(
-            "preset is 'scaled', a rule for the dimension of an action: those of "
-            f"{env} are discrete, it must be another preset, such as 'gymnax'"
-        )
+        return presets.DISCRETE_SIZE
     return int(built.action_size)
 
 

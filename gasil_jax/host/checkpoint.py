@@ -1,9 +1,9 @@
-"""Save and load training states.
+"""Save and load training states with Orbax.
 
 `save` and `restore` handle a single state. `write`, `latest`, `best` and `prune` manage
 a folder of checkpoints. Each checkpoint is a folder named by its iteration:
 
-    00000490/state.npz       the state's arrays by their path in it
+    00000490/state/          the state, written by Orbax
     00000490/manifest.json   SHA-256 of each of its files, and a record
 
 A checkpoint is written to 00000490.partial, which is renamed once it has been read
@@ -15,20 +15,26 @@ training continues from an older one.
 import contextlib
 import hashlib
 import json
+import logging
 import math
 import os
 import pathlib
+import re
 import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
 from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from gasil_jax import npz
 from gasil_jax.host import json_files, output_file
 
-_STATE, _MANIFEST = "state.npz", "manifest.json"
+_STATE, _MANIFEST = "state", "manifest.json"
+#: The name of the only array of a state that has none.
+_NOTHING = "nothing"
 _PARTIAL, _DAMAGED = ".partial", ".damaged"
 #: Errors of reading a damaged checkpoint. Other errors, such as those of a network file
 #: system, do not mean that it is damaged.
@@ -48,43 +54,118 @@ def _as_arrays(state: Any) -> dict[str, Any]:
     }
 
 
-def save(path: pathlib.Path, state: Any) -> None:
-    """Write `state`, a pytree of arrays, to a new file, and read it again."""
+@contextlib.contextmanager
+def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
+    """Yield Orbax's checkpointer, and another path to a folder that it understands.
+
+    Orbax takes a path with brackets or stars for a pattern, so no character of the
+    other path means anything. What fails in Orbax's threads is raised once, and not
+    logged.
+    """
+    # Commands that read no checkpoint, such as --help, start sooner without it.
+    import orbax.checkpoint as ocp
+
+    logger, before = logging.getLogger("absl"), sys.unraisablehook
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)
+    logging.getLogger("asyncio").addFilter(_is_news)
+
+    def report(unraisable: Any) -> None:
+        # TensorStore reports each array to Orbax's loop, which ends with the first.
+        if "Event loop is closed" not in str(unraisable.exc_value):
+            before(unraisable)
+
+    sys.unraisablehook = report
+    try:
+        with tempfile.TemporaryDirectory() as directory:
+            link = pathlib.Path(directory, "checkpoints")
+            link.symlink_to(folder.absolute().parent, target_is_directory=True)
+            with ocp.StandardCheckpointer() as checkpointer:
+                yield checkpointer, link / folder.name
+    except (ValueError, OSError) as error:
+        # TensorStore's message is long, and names the other path.
+        if codes := re.findall(r"os_error_code='(\d+)'", "".join(_chain(error))):
+            raise OSError(int(codes[0]), os.strerror(int(codes[0]))) from None
+        raise
+    else:
+        # After an error threads that are left still report.
+        sys.unraisablehook = before
+    finally:
+        logger.setLevel(level)
+
+
+def _chain(error: BaseException | None) -> list[str]:
+    """Return the messages of an error and of those that led to it, the first one first.
+
+    Orbax cleans up behind its own failure, and that may fail in its turn.
+    """
+    if error is None:
+        return []
+    return [*_chain(error.__cause__ or error.__context__), str(error)]
+
+
+def _is_news(record: logging.LogRecord) -> bool:
+    """Return false for an operating system's error of a single array.
+
+    Orbax raises the first such error itself, so its threads need not log the others.
+    """
+    return "os_error_code" not in record.getMessage()
+
+
+def save(folder: pathlib.Path, state: Any) -> None:
+    """Write `state`, a pytree of arrays, to a new folder, and read it again.
+
+    Arrays of no size, which Orbax refuses, are left out; `restore` makes them anew.
+    """
     arrays: dict[str, Any] = jax.tree.map(np.asarray, _as_arrays(state))
-    with path.open("wb") as file:
-        np.savez(file, **arrays)
-    again = npz.read(path)
+    arrays = {name: x for name, x in arrays.items() if x.size}
+    with _orbax(folder) as (checkpointer, path):
+        checkpointer.save(path, arrays or {_NOTHING: np.zeros(1, bool)})
+    again = _read_arrays(folder)
     for name, array in arrays.items():
-        if again[name].tobytes() != array.tobytes():
+        if not np.array_equal(_bytes(again[name]), _bytes(array)):
             raise OSError(f"{name or 'its array'} is not what was written")
 
 
-def restore(path: pathlib.Path, like: Any) -> Any:
+def _bytes(array: np.ndarray) -> np.ndarray:
+    # Not-a-numbers are equal, and so are types that NumPy does not know.
+    return np.ascontiguousarray(array).ravel().view(np.uint8)
+
+
+def _read_arrays(folder: pathlib.Path) -> dict[str, Any]:
+    """Return the arrays in a folder that `save` wrote, by their path in the state."""
+    with _orbax(folder) as (checkpointer, path):
+        arrays = checkpointer.restore(path)
+    arrays.pop(_NOTHING, None)
+    return arrays
+
+
+def restore(folder: pathlib.Path, like: Any) -> Any:
     """Read a state that `save` wrote, as NumPy arrays and random keys.
 
     They are not put on a device, which may be too small for all members together.
     """
     expected = jax.eval_shape(_as_arrays, like)
-    arrays = npz.read(path)
+    arrays = _read_arrays(folder)
+    missing = {x: y for x, y in expected.items() if x not in arrays and not y.size}
+    arrays |= {name: np.zeros(x.shape, x.dtype) for name, x in missing.items()}
 
-    def form(x: Any) -> Any:
-        if x is None:
-            return None
-        # The file does not know types that are not NumPy's, such as bfloat16.
-        dtype = np.dtype(f"V{x.dtype.itemsize}") if x.dtype.kind == "V" else x.dtype
-        return x.shape, dtype
+    # Orbax may silently restore only a part of a tree that does not match.
+    def shape(tree: Any) -> dict[str, Any]:
+        return {name: (x.shape, str(x.dtype)) for name, x in tree.items()}
 
-    for name in sorted({*arrays, *expected}):
-        if form(arrays.get(name)) != form(expected.get(name)):
-            raise ValueError(f"{path} holds another state: {name} differs")
+    if shape(arrays) != shape(expected):
+        names = set(arrays) ^ set(expected) or {
+            name for name in expected if shape(arrays)[name] != shape(expected)[name]
+        }
+        raise ValueError(f"{folder} holds another state: {min(names)} differs")
     leaves, structure = jax.tree_util.tree_flatten_with_path(like)
-    values = []
-    for way, leaf in leaves:
-        name = jax.tree_util.keystr(way)
-        array = arrays[name].view(expected[name].dtype)
-        if _is_key(leaf):
-            array = jax.random.wrap_key_data(array, impl=_key_impl(leaf))
-        values.append(array)
+    values = [
+        jax.random.wrap_key_data(arrays[jax.tree_util.keystr(path)], impl=_key_impl(x))
+        if _is_key(x)
+        else np.asarray(arrays[jax.tree_util.keystr(path)])
+        for path, x in leaves
+    ]
     return jax.tree.unflatten(structure, values)
 
 

@@ -33,6 +33,7 @@ SELF_TAUGHT = (
     # The best two episodes, which differ from the others.
     gasil_jax.PPOBC(buffer_steps=100),
     gasil_jax.PPOBCNovelty(buffer_steps=100),
+    gasil_jax.PPOGASILNovelty(**DISCRIMINATOR),
     gasil_jax.PPOSIL(),
     gasil_jax.GASIL(alpha=1.0, **DISCRIMINATOR),
     gasil_jax.PPOGASIL(alpha=1.0, **DISCRIMINATOR),

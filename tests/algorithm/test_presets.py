@@ -13,6 +13,7 @@ from gasil_envs import locomotion
 from gasil_jax import algorithms, presets
 from gasil_jax.cli import options
 
+ONE = "ppo+gasil+novelty"
 TASKS = ("hopper", "walker2d", "halfcheetah", "swimmer", "ant", "humanoid")
 
 
@@ -54,13 +55,20 @@ def test_scaled_rows_follow_the_number_of_actions(env):
         assert sized == row
 
 
-def test_an_environment_of_ones_own_is_scaled_by_its_actions():
-    row = gasil_jax.preset("my:env", "ppo", "scaled", action_size=2)
-    # It has two, and fewer have the values of two.
-    assert parse("point_mass", "--agent", "ppo", "--preset", "scaled") == row
-    assert gasil_jax.preset("my:env", "ppo", "scaled", action_size=1) == row
+@pytest.mark.parametrize(
+    ("agent", "name"), [(x, "scaled") for x in presets.RULED] + [(ONE, "tuned")]
+)
+def test_an_environment_of_ones_own_is_scaled_by_its_actions(agent, name):
+    row = gasil_jax.preset("my:env", agent, name, action_size=2)
+    # It has two, and fewer have the values of two, as discrete actions do.
+    words = ("--agent", agent, "--preset", name)
+    assert parse("point_mass", *words) == row
+    assert parse("sparse:key_grid", *words) == row
+    assert gasil_jax.preset("my:env", agent, name, action_size=1) == row
+    expected = presets.scaled(2, decompose_rewards=False)
+    assert row == gasil_jax.algorithm(agent, **expected)
     with pytest.raises(ValueError, match="needs the dimension of my:env's actions"):
-        gasil_jax.preset("my:env", "ppo", "scaled")
+        gasil_jax.preset("my:env", agent, name)
 
 
 def test_the_command_line_starts_from_the_preset():

@@ -33,6 +33,7 @@ AGENTS = (
     gasil_jax.PPOBC(buffer_steps=100),
     gasil_jax.PPONovelty(),
     gasil_jax.PPOBCNovelty(buffer_steps=100),
+    gasil_jax.PPOGASILNovelty(**IMITATION),
     gasil_jax.PPOSIL(sil_buffer_steps=500, sil_minibatch_size=64),
     gasil_jax.GASIL(**IMITATION),
     gasil_jax.PPOGASIL(**IMITATION),

@@ -54,10 +54,10 @@ def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
     assert evaluate.main([str(out), "--checkpoint", "best", "--episodes", "1"]) == 0
     (root,) = out.glob("programs/*/checkpoints")
     best = checkpoint.best(root).folder
-    (best / "state.npz").write_bytes(b"")
+    (best / "state" / "_METADATA").write_text("{}")
     capsys.readouterr()
     told = refused(capsys, evaluate, out, "--checkpoint", "best")
-    assert f"{best} is damaged: state.npz is not what was written" in told
+    assert f"{best} is damaged: state/_METADATA is not what was written" in told
 
 
 @on_trained

@@ -80,9 +80,8 @@ mass --LONGx | is unknown
 mass --agent gail | expert is missing
 mass --agent gail --expert nowhere.npz | it must be an .npz file
 mass --agent gail --expert minari:nothing/there-v0 | minari:nothing/there-v0
-mass --agent gasil --preset scaled | it has ppo on hopper, walker2d, halfcheetah, swimme
+mass --agent gasil --preset scaled | it has ppo, ppo+novelty, ppo+bc
 corridor --policy-components 4 | policy_components is 4: it must be 1, the
-corridor --preset scaled | preset is 'scaled', a rule for the dimension
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
 sweep --random 0 | random is 0

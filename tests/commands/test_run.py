@@ -265,6 +265,7 @@ gymnax:CartPole-v1 --preset gymnax |
 walker2d --agent ppo+bc --preset paper |
 walker2d --agent ppo --reward-delay 20 |
 walker2d --agent ppo --preset scaled --reward-delay 20 |
+sparse:u_maze --agent ppo+gasil+novelty |
 """
 
 

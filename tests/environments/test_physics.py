@@ -195,6 +195,19 @@ def test_newton_against_plain_numpy(size, groups, pulling):
         )
 
 
+def test_a_search_that_would_come_and_go_ends():
+    """Newton's steps go from one end of where friction gives to the other and back."""
+    force = jnp.linspace(-24.0, -18.0, 61)[:, None]
+    limit = newton.LimitRows(*(jnp.full((61, 1), x) for x in (-1.0, 3.777, 19.0)))
+    friction = newton.FrictionRows(*(jnp.full((61, 1), x) for x in (0.032, 9.0, 42.0)))
+    inertia, start = jnp.ones((61, 1, 1)), jnp.full((61, 1), -7.18)
+    problem = newton.Problem(inertia, force, start, limit, friction=friction)
+    qacc = jax.jit(jax.vmap(lambda p: solve(p, 20)))(problem).qacc
+    pushes = 19.0 * jnp.maximum(3.777 + qacc, 0.0)
+    held = force - pushes - jnp.clip(9.0 * (qacc - 0.032), -42.0, 42.0)
+    np.testing.assert_allclose(qacc, held, atol=1e-4)
+
+
 @pytest.mark.parametrize("batch", [(3, 4), (5, 32)])  # one tile, and more of them
 def test_a_problem_alone_equals_itself_in_nested_batches(batch):
     _, problem = problems(batch, 6, [(2, SIMPLE), (4, FLAT)])

@@ -128,15 +128,6 @@ def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):
     assert what in caplog.text and "\n" not in caplog.records[0].getMessage()
 
 
-def test_fields_about_a_base_that_does_not_move_are_mjxs(caplog):
-    xml = arm().replace('name="arm">', 'name="base"><geom size="1"/><body>')
-    xml = xml.replace("</body></worldbody>", "</body></body></worldbody>")
-    Locomotion(Task(xml=xml, frame_skip=1, hidden_positions=0))
-    assert not caplog.text
-    Locomotion(Task(xml=xml, frame_skip=1, hidden_positions=0, fields=("cvel",)))
-    assert "its base has a mass and does not move, and cvel is returned" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("parts", "what"),
     [

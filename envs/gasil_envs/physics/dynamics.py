@@ -37,6 +37,7 @@ class Dynamics(NamedTuple):
       actuators: the actuators' constants.
       tendons: the fixed tendons.
       iterations: largest numbers of iterations of the solver and of a line search.
+      presses: whether float32 may lose digits of the constraints' forces.
       fields: names of the fields to return, of `FIELDS`.
     """
 
@@ -45,11 +46,13 @@ class Dynamics(NamedTuple):
     actuators: actuators.Actuators
     tendons: tendons.Tendons
     iterations: tuple[int, int]
+    presses: bool
     fields: tuple[str, ...]
 
 
-# From this stiffness of contacts on float32 loses digits of their forces.
-_STIFF = 300.0
+# From this stiffness of contacts on, and from this depth at the start in sizes of a
+# body, float32 loses digits of the constraints' forces.
+_STIFF, _DEEP = 20.0, 0.01
 #: Fields that are about the centre of mass of each body's own tree, with its base.
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
@@ -87,8 +90,8 @@ def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
     return model
 
 
-def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
-    """Return why `make` does not support this model and fields; None if it does."""
+def unsupported(model: mujoco.MjModel) -> str | None:
+    """Return why `make` does not support this model; None if it does."""
     model = _enabled(model)
     if model.opt.integrator not in (_EULER, _RK4, _IMPLICITFAST):
         return "its integrator is neither Euler, RK4 nor implicitfast"
@@ -96,15 +99,6 @@ def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None
     if model.opt.integrator == _IMPLICITFAST:
         if medium or tree.has_lone_bodies(model):
             return "it has a medium or a free body without others, with implicitfast"
-    of_one_tree = [x for x in fields if x in _OF_ONE_TREE]
-    fixed = (model.body_weldid == 0) & (model.body_mass > 0)
-    if (
-        of_one_tree
-        and np.isin(model.body_rootid[fixed], model.body_rootid[model.dof_bodyid]).any()
-    ):
-        return (
-            f"its base has a mass and does not move, and {of_one_tree[0]} is returned"
-        )
     return (
         actuators.unsupported(model)
         or tendons.unsupported(model)
@@ -121,12 +115,16 @@ def make(
 ) -> Dynamics:
     """Compute what does not depend on the state, for a supported model."""
     model = _enabled(model)
+    layout, data = constraints.layout(model), mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    deepest = -data.contact.dist.min(initial=0.0)
     return Dynamics(
         model,
-        constraints.layout(model),
+        layout,
         actuators.make(model),
         tendons.fixed(model),
         (iterations, ls_iterations),
+        layout.stiffness > _STIFF or deepest > _DEEP * model.stat.meansize,
         tuple(fields),
     )
 
@@ -153,20 +151,21 @@ def _fields(names: Sequence[str], at: tree.Kinematics, *others: jax.Array) -> Fi
     return {name: x for name, x in every if name in names}
 
 
-def kinematics(
-    model: mujoco.MjModel,
-    names: Sequence[str],
-    state: PhysicsState,
-    *,
-    with_bases: bool = False,
-) -> Fields:
-    """Return the named fields at `state`, with all forces 0.
+def _place(
+    model: mujoco.MjModel, names: Sequence[str], qpos: jax.Array
+) -> tree.Kinematics:
+    # What is heavy and does not move costs digits, so it counts only if it is seen.
+    fixed = (model.body_treeid < 0) & (model.body_mass > 0)
+    seen = bool({*names} & {*_OF_ONE_TREE})
+    return tree.kinematics(model, qpos, with_bases=seen and bool(fixed.any()))
 
-    With `with_bases` those about a tree's centre of mass count its parts that do not
-    move, as C MuJoCo does.
-    """
+
+def kinematics(
+    model: mujoco.MjModel, names: Sequence[str], state: PhysicsState
+) -> Fields:
+    """Return the named fields at `state`, with all forces 0."""
     size = state.qpos.shape[-1]
-    at = tree.kinematics(model, state.qpos, with_bases=with_bases)
+    at = _place(model, names, state.qpos)
     cvel = tree.velocity(model, at.cdof, state.qvel)
     no_force = jnp.zeros((model.nv, size), jnp.float32)
     of_bodies = jnp.zeros((model.nbody, 6, size), jnp.float32)
@@ -181,7 +180,7 @@ def forward(
     `actuation` are the forces (V, B) of motors, or the controls (nu, B) of others.
     """
     model, (qpos, qvel) = dynamics.model, (state.qpos, state.qvel)
-    at = tree.kinematics(model, qpos)
+    at = _place(model, dynamics.fields, qpos)
     smooth = tree.smooth(model, at, qpos, qvel)
     if not dynamics.actuators.are_motors:
         actuation = actuators.forces(dynamics.actuators, actuation, qpos, qvel)
@@ -226,7 +225,7 @@ def forward(
         return solution.qacc, solution.constraint_force, of_bodies
 
     qacc, constraint_force, of_bodies = _with_contacts_in_play(constrain, contacts)
-    if dynamics.layout.stiffness > _STIFF:
+    if dynamics.presses:
         # The rows' forces are differences of large numbers; their sum need not be.
         held = total(smooth.inertia * qacc, 1)
         constraint_force = held - force

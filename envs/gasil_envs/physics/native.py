@@ -156,9 +156,7 @@ class MujocoPhysics:
         self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
         # Initial states are computed far more often than they are used, so they are
         # computed without a host call.
-        self._place = batch_last(
-            partial(dynamics.kinematics, model, self._fields, with_bases=True)
-        )
+        self._place = batch_last(partial(dynamics.kinematics, model, self._fields))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
         """Return the state at positions (nq,) and velocities (nv,), warm start 0."""

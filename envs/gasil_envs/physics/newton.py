@@ -243,7 +243,8 @@ def _piece(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     if most is None:
         return d < 0.0
     force = w * d
-    return jnp.sign(force) * (jnp.abs(force) >= most)
+    # One that is not a number is equal to itself, so that the iterations end.
+    return jnp.where(jnp.abs(force) >= most, jnp.sign(force), 0.0)
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
@@ -255,6 +256,8 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
       line_search: largest number of steps of each line search.
     """
     each = jax.tree.map
+    # A row that bends twice can send a search from one end to the other for ever.
+    pulls = any(most is not None for most in system.bound)
 
     def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
         """Return a function of each row; `others` are the last arguments."""
@@ -300,7 +303,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         quadratic = dot(direction, system.inertia_times(direction))
 
         def search_step(search: Any) -> Any:
-            step, low, high, before = search
+            (step, is_newton), low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
             bent = each(jnp.multiply, of_rows(_curvature, there), slope)
             second = quadratic + dot(bent, slope)
@@ -310,15 +313,21 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             high = jnp.where(first < 0.0, high, step)
             following = step - first / jnp.maximum(second, 1e-20)
             inside = (following >= low) & (following <= high)
+            if pulls:
+                other_end = jnp.where(first < 0.0, high, low)
+                inside &= jnp.abs(following - other_end) > 0.01 * (high - low)
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
-            return (following, low, high, now), system.differ(before, now)
+            # Newton's step within one piece is the last; half of the way is none.
+            goes_on = system.differ((before, is_newton), (now, is_newton | True))
+            return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
-        search = (step, jnp.zeros_like(step), jnp.full_like(step, 1e3), before)
-        step = system.repeat(
+        low, high = jnp.zeros_like(step), jnp.full_like(step, 1e3)
+        search = ((step, step > 0.0), low, high, before)
+        (step, _), *_ = system.repeat(
             search_step, search, least=1, most=line_search, is_short=True
-        )[0]
+        )
         qacc, moved = each(
             lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
         )

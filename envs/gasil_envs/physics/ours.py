@@ -18,9 +18,9 @@ from gasil_envs.precision import full_precision
 _LOGGER = logging.getLogger(__name__)
 
 
-def unsupported(model: mujoco.MjModel, fields: Sequence[str] = ()) -> str | None:
+def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why our physics does not take a model; None if it does."""
-    return dynamics.unsupported(model, fields) or left_out(model)
+    return dynamics.unsupported(model) or left_out(model)
 
 
 def ours_or_mjx(
@@ -34,7 +34,7 @@ def ours_or_mjx(
     Raises:
       ValueError: if neither takes the model.
     """
-    reason = unsupported(model, fields)
+    reason = unsupported(model)
     if reason is None:
         return JaxPhysics(model, fields, iterations, ls_iterations)
     try:

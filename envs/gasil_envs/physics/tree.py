@@ -20,7 +20,14 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import add, materialize, stacked, take, total
+from gasil_envs.physics.batching import (
+    add,
+    constant_times,
+    materialize,
+    stacked,
+    take,
+    total,
+)
 
 FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -29,9 +36,9 @@ FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_HINGE),
 )
 _NEGLIGIBLE = 1e-9
-#: From this distance from the origin on, metres, and this condition of the joint-space
-#: inertia on, rounding moves bodies by more than 1e-5 of their velocity in a step.
-_FAR, _UNEVEN = 20.0, 5e3
+#: From this distance from the origin on, metres and sizes of a body, and this condition
+#: of the joint-space inertia on, rounding costs more than 1e-5 of a step.
+_FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 5e3
 
 
 class Kinematics(NamedTuple):
@@ -58,8 +65,6 @@ class Kinematics(NamedTuple):
 
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
-    if model.jnt_stiffness[model.jnt_type <= BALL].any():
-        return "it has free joints or balls with springs"
     if model.jnt_actgravcomp.any():
         return "it has gravity compensated by actuators"
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
@@ -87,9 +92,9 @@ def rounding(model: mujoco.MjModel) -> list[str]:
     own = np.sqrt(np.diag(inertia))
     away = np.linalg.norm(data.xpos[model.body_treeid >= 0], axis=1).max(initial=0.0)
     found = []
-    if away > _FAR:
+    if away > min(_FAR, _FAR_IN_SIZES * model.stat.meansize):
         found.append(
-            f"bodies {away:.0f} m from the origin, where positions are rounded to "
+            f"bodies {away:.3g} m from the origin, where positions are rounded to "
             f"{away * 1e-7:.0e} m"
         )
     if (condition := np.linalg.cond(inertia / np.outer(own, own))) > _UNEVEN:
@@ -420,7 +425,9 @@ def smooth(
     bias = total(cdof * moved[:, 10:], 1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
     scalar = model.jnt_type > BALL
-    if model.jnt_stiffness.any():
+    for joint in np.flatnonzero(model.jnt_stiffness * ~scalar):
+        passive = passive - _turned_spring(model, joint, qpos)
+    if model.jnt_stiffness[scalar].any():
         index = model.jnt_qposadr[scalar]
         stretch = (
             take(qpos, index) - model.qpos_spring[index].astype(np.float32)[:, None]
@@ -432,6 +439,24 @@ def smooth(
         passive = passive - total(stiffness[..., None] * stretch, 1)
     unit_momentum = materialize(_momentum(moved[:, :10], cdof))
     return Smooth(_joint_inertia(model, unit_momentum, cdof), passive - bias, cvel)
+
+
+def _turned_spring(model: mujoco.MjModel, joint: int, qpos: jax.Array) -> jax.Array:
+    """Return minus the force (V, B) of the spring of a free joint or a ball."""
+    first, dof, parts = model.jnt_qposadr[joint], model.jnt_dofadr[joint], []
+    if model.jnt_type[joint] == FREE:
+        rest = model.qpos_spring[first : first + 3].astype(np.float32)
+        parts.append(qpos[first : first + 3] - rest[:, None])
+        first += 3
+    # From the spring's orientation to the joint's.
+    w, x, y, z = model.qpos_spring[first : first + 4]
+    back = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
+    axis, angle = axis_angle(constant_times(back, qpos[first : first + 4]))
+    stretch = jnp.concatenate([*parts, axis * angle])
+    none = jnp.zeros((model.nv, qpos.shape[-1]), jnp.float32)
+    return float(model.jnt_stiffness[joint]) * jnp.concatenate(
+        [none[:dof], stretch, none[dof + len(stretch) :]]
+    )
 
 
 def _joint_inertia(
