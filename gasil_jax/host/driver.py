@@ -106,7 +106,7 @@ class Outcome:
 class _Training:
     """Members in training."""
 
-    members: Members  # the members
+    members: Members
     # Their states, padded once training is compiled; None for the first ones.
     states: Any = None
     done: int = 0  # number of iterations so far

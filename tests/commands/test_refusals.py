@@ -69,6 +69,7 @@ hopper --resume=3 | resume: ignored explicit argument '3'
 hopper ant | 'ant' is not an option or its value: see --help
 mass --max-episode-steps 51 | from 1 to 50, the environment's
 mass --evaluate-every 0 | evaluate_every is 0: it must be from 1
+mass --video-every 0 | video_every is 0: it must be from 1
 mass --evaluate-every x | evaluate_every is 'x': it must be a whole number
 mass --evaluate-every 9 --evaluate-episodes 0 | evaluate_episodes is 0: it must
 mass --evaluate-episodes 3 | evaluate_episodes is 3: it needs evaluate_every
