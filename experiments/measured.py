@@ -1,4 +1,4 @@
-"""The tables of docs/scaling.md, which the commands above them write.
+"""The tables of docs/performance.md, which the commands above them write.
 
 A command with the option `page` puts what it has measured below the same command in the
 page, between ``<!-- begin -->`` and ``<!-- end -->``.
@@ -18,7 +18,7 @@ from experiments.tables import markdown_table
 from gasil_jax.errors import InputError
 from gasil_jax.host import environments, output_file
 
-PAGE = pathlib.Path(__file__).parent.parent / "docs/scaling.md"
+PAGE = pathlib.Path(__file__).parent.parent / "docs/performance.md"
 _TABLE = re.compile(
     r"\$ (?:taskset -c 0 )?python -m experiments (\w+)([^\n]*)\n```\n\n"
     r"<!-- begin -->\n(.*?)<!-- end -->",

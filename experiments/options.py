@@ -34,8 +34,8 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--results", type=pathlib.Path, default=RESULTS, help=help)
 
     def add_page(self) -> None:
-        """Add the option to write a table into docs/scaling.md."""
-        words = "write it into docs/scaling.md too, below the same command"
+        """Add the option to write a table into docs/performance.md."""
+        words = "write it into docs/performance.md too, below the same command"
         self.add_argument("--page", action="store_true", help=words)
 
 
