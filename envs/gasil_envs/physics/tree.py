@@ -426,7 +426,7 @@ def smooth(
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
     scalar = model.jnt_type > BALL
     for joint in np.flatnonzero(model.jnt_stiffness * ~scalar):
-        passive = passive - _turned_spring(model, joint, qpos)
+        passive = passive - _turned_spring(model, int(joint), qpos)
     if model.jnt_stiffness[scalar].any():
         index = model.jnt_qposadr[scalar]
         stretch = (
