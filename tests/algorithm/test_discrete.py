@@ -105,20 +105,15 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
         np.testing.assert_array_equal(action, logits.argmax(axis=1))
         assert action.dtype == np.int32
     weights = numpy_policy.read(path, 4)
-    p = numpy_policy.probabilities(weights, observation)
-    np.testing.assert_allclose(p, jax.nn.softmax(logits), rtol=1e-4)
-    # Both draw by these probabilities, of an observation for which none is near 1.
+    # Both draw by probability, of an observation for which none is near 1.
     weights["kernel_1"] = 0.1 * weights["kernel_1"]
-    expected = numpy_policy.probabilities(weights, observation[0])
+    expected = jax.nn.softmax(numpy_policy.output(weights, observation[0]))
     assert expected.max() < 0.9
     many = np.tile(observation[0], (20_000, 1))
     drawn = numpy_policy.make(weights)(many, np.random.default_rng(0))
     np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
     drawn = policy.make(weights)(many, jax.random.key(0))
     np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
-    continuous = numpy_policy.read("zoo:hopper")
-    with pytest.raises(ValueError, match="actions are not discrete"):
-        numpy_policy.probabilities(continuous, np.zeros(11))
 
 
 FLAGS = (

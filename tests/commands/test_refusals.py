@@ -38,7 +38,7 @@ run --env json:loads | arguments: missing a required argument: 's'
 run --resume | resume needs --out and the folder to continue
 run --resume --out nosuch | out is nosuch, which holds no run to continue: to
 hopper --agent ppo+gasill | did you mean 'ppo+gasil'?
-hopper --agent ppo --alpha 0.7 | alpha is a setting of gasil, ppo+gasil, gail, not
+hopper --agent ppo --alpha 0.7 | alpha is a setting of gasil, ppo+gasil, ppo+gasil+n
 hopper --agent ppo+sil --buffer-episodes 3 | --buffer-episodes is unknown: buffer_
 hopper --preset papre | did you mean 'paper'
 hopper --seeds 0 | seeds is 0: it must be from 1 to
@@ -61,6 +61,7 @@ hopper --resume=3 | resume: ignored explicit argument '3'
 hopper ant | 'ant' is not an option or its value: see --help
 mass --max-episode-steps 51 | from 1 to 50, the environment's
 mass --evaluate-every 0 | evaluate_every is 0: it must be from 1
+mass --video-every 0 | video_every is 0: it must be from 1
 mass --evaluate-episodes 3 | evaluate_episodes is 3: it needs evaluate_every
 mass --evaluate-every 9 --evaluate-episodes 1e12 | GB of memory
 mass --out LONGx | too long
@@ -68,7 +69,7 @@ mass --alpha LONGx | alpha is 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx
 mass --agent gail | expert is missing
 mass --agent gail --expert nowhere.npz | it must be an .npz file
 mass --agent gail --expert minari:nothing/there-v0 | minari:nothing/there-v0
-mass --agent gasil --preset scaled | it has ppo, ppo+novelty, ppo+bc
+mass --agent gasil --preset scaled | it has ppo, ppo+novelty, ppo+gasil+n
 corridor --policy-components 4 | policy_components is 4: it must be 1, the
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
