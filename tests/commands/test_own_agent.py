@@ -200,11 +200,11 @@ NUMBERS = """
 --my-weight much | my_weight is 'much': it must be a number
 --my-wieght 0.2 | --my-weight
 --agent ppo --my-weight 0.2 | option --my-weight is unknown
---alpha 0.2 | alpha is a setting of gasil, ppo+gasil, gail
+--alpha 0.2 | alpha is a setting of gasil, ppo+gasil, ppo+gasil+novelty
 --grid my_weight=0.1,2 | my_weight is 2.0: it must be 0 or more
 --grid my_wieght=0.1 | did you mean 'my_weight'?
 --agent ppo --grid my_weight=0.1 | 'my_weight' can't vary
---grid alpha=0.1 | alpha is a setting of gasil, ppo+gasil, gail
+--grid alpha=0.1 | alpha is a setting of gasil, ppo+gasil, ppo+gasil+novelty
 """
 
 
