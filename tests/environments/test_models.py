@@ -130,6 +130,11 @@ MODELS = {
         <joint axis="1 0 0"/><geom type="capsule" size="0.05 0.2" pos="0 0.3 0.2"/>
         </body></body><body pos="-1 0 1"><geom size="0.8"/></body>"""
     ),
+    "forces that balance each other": """<mujoco><option timestep="0.002"/><worldbody>
+        <geom type="plane" size="1 1 1"/><body pos="0 0 -0.05"><joint axis="1 2 0.5"
+        name="a" damping="1e-8" pos="0.01 0 0"/><geom type="capsule" condim="6"
+        size="0.01 0.01" mass="0.001"/></body></worldbody><actuator>
+        <motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>""",
     "trees far apart": arms(
         option='integrator="RK4"',
         world="""<body pos="100 0 0"><freejoint/>

@@ -88,7 +88,7 @@ def problems(batch, size, groups, seed=0, *, pulling=False):
     sign = rng.integers(-1, 2, size=(*batch, size)).astype(float)
     draw_reference = lambda *shape: rng.normal(size=(*batch, *shape)) - 1.0
     draw_weight = lambda *shape: 10.0 ** rng.uniform(-1.0, 2.0, size=(*batch, *shape))
-    limits = newton.LimitRows(sign, draw_reference(size), draw_weight(size))
+    limits = newton.JointRows(sign, draw_reference(size), draw_weight(size))
     jacobian = [sign[..., None] * np.eye(size)]
     reference, weight, contacts = [limits.reference], [limits.weight], []
     for count, edges in groups:
@@ -104,16 +104,18 @@ def problems(batch, size, groups, seed=0, *, pulling=False):
         reference.append(group.reference.reshape(*batch, -1))
         weight.append(group.weight.reshape(*batch, -1))
     bound = np.zeros((*batch, sum(x.shape[-1] for x in reference)))
-    friction = None
+    joints = [limits]
     if pulling:
         # The last group's rows pull as well: every other one without bound.
         most = np.where(np.arange(contacts[-1].weight.shape[-2]) % 2, np.inf, 1.0)
         most = np.broadcast_to(most[:, None], contacts[-1].weight.shape)
         contacts[-1] = contacts[-1].replace(bound=most)
         bound[..., -most[0].size :] = most.reshape(*batch, -1)
-        friction = newton.FrictionRows(
-            draw_reference(size), draw_weight(size), rng.uniform(size=(*batch, size))
+        most = rng.uniform(size=(*batch, size))
+        friction = newton.JointRows(
+            np.ones_like(most), draw_reference(size), draw_weight(size), most
         )
+        joints.append(friction)
         jacobian.append(np.broadcast_to(np.eye(size), (*batch, size, size)))
         reference.append(friction.reference)
         weight.append(friction.weight)
@@ -122,9 +124,8 @@ def problems(batch, size, groups, seed=0, *, pulling=False):
         inertia=root @ np.swapaxes(root, -1, -2) + np.eye(size),
         force=5.0 * rng.normal(size=(*batch, size)),
         warmstart=rng.normal(size=(*batch, size)),
-        limits=limits,
+        joints=tuple(joints),
         contacts=tuple(contacts),
-        friction=friction,
     )
     arrays = {
         "inertia": problem.inertia,
@@ -198,10 +199,11 @@ def test_newton_against_plain_numpy(size, groups, pulling):
 def test_a_search_that_would_come_and_go_ends():
     """Newton's steps go from one end of where friction gives to the other and back."""
     force = jnp.linspace(-24.0, -18.0, 61)[:, None]
-    limit = newton.LimitRows(*(jnp.full((61, 1), x) for x in (-1.0, 3.777, 19.0)))
-    friction = newton.FrictionRows(*(jnp.full((61, 1), x) for x in (0.032, 9.0, 42.0)))
+    limit = newton.JointRows(*(jnp.full((61, 1), x) for x in (-1.0, 3.777, 19.0)))
+    friction = (jnp.full((61, 1), x) for x in (1.0, 0.032, 9.0, 42.0))
     inertia, start = jnp.ones((61, 1, 1)), jnp.full((61, 1), -7.18)
-    problem = newton.Problem(inertia, force, start, limit, friction=friction)
+    joints = limit, newton.JointRows(*friction)
+    problem = newton.Problem(inertia, force, start, joints)
     qacc = jax.jit(jax.vmap(lambda p: solve(p, 20)))(problem).qacc
     pushes = 19.0 * jnp.maximum(3.777 + qacc, 0.0)
     held = force - pushes - jnp.clip(9.0 * (qacc - 0.032), -42.0, 42.0)

@@ -8,13 +8,12 @@ import pytest
 from experiments import search
 from experiments.search import (
     AGENTS,
-    CELLS,
     SPACES,
     TASKS,
     Search,
     SingleSetting,
 )
-from experiments.store import RESULTS, Record, Store
+from experiments.store import Record, Store
 
 
 def fill(store, one, points, scores, seeds=(1000, 1001)):
@@ -77,16 +76,6 @@ def test_a_point_that_ended_no_episode_is_not_chosen(tmp_path):
     assert one.points(store)[len(drawn) :] == tuple(search.beyond("ppo", drawn[1]))
 
 
-def test_delayed_rewards_are_decomposed_for_two_curves():
-    decomposed = {
-        (delay, name)
-        for _, delay in CELLS
-        for name, one in search.searches("hopper", delay).items()
-        if one.algorithm({}).settings["decompose_rewards"]
-    }
-    assert decomposed == {(20, "ppo+gasil-adaptive"), (20, "ppo (decomposed)")}
-
-
 def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):
     store, single = Store(tmp_path), SingleSetting("hopper", "ppo", 20)
     points = search.draw("ppo")
@@ -128,21 +117,3 @@ def test_the_papers_protocol_has_the_appendix_s_values():
         for name, values in search.PAPER_SPACES[agent].items():
             counts = collections.Counter(point[name] for point in points)
             assert set(counts) == set(values) and len(set(counts.values())) == 1
-    one = search.PaperSearch("hopper", "ppo+gasil", 20)
-    for runs in one.runs(one.points(Store(RESULTS / "runs"))):
-        assert [run.seed for run in runs] == [1000, 1001]
-        algorithm, config = runs[0].algorithm, runs[0].algorithm.config
-        assert (config.num_envs, config.num_steps) == (1, 2048)
-        assert algorithm.settings["normalize_rewards"] and not config.stagger_episodes
-        assert (config.num_epochs, config.minibatch_size) == (10, 64)
-        assert (config.gamma, config.gae_lambda) == (0.99, 0.95)
-        assert config.initial_std == 1.0 and config.entropy_coefficient == 0.0
-
-
-def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
-    store, one = Store(tmp_path), search.PaperSearch("hopper", "ppo", 20)
-    raw = search.PaperSearch("hopper", "ppo", 20, normalize_rewards=False)
-    assert one.best(store) is None
-    fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
-    assert one.chosen(store) == {"learning_rate": 5e-5}
-    assert not store.missing(one.requested(store)) and raw.chosen(store) is None

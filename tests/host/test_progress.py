@@ -2,7 +2,6 @@
 
 import functools
 import io
-import threading
 import time
 
 import numpy as np
@@ -38,15 +37,6 @@ def test_a_long_phase_says_for_how_long_it_has(monkeypatch, capsys):
     assert text.startswith("hopper: compiling\nhopper: compiling (0 s)\n")
 
 
-def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_SECONDS_BEFORE_ANNOUNCEMENT", 600.0)
-    before = threading.active_count()
-    with progress.announced("hopper", "building"):
-        assert threading.active_count() == before + 1
-    assert threading.active_count() == before
-    assert capsys.readouterr().err == ""
-
-
 def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     clock = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
@@ -62,16 +52,6 @@ def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     assert lines[1] == (
         "hopper ppo: 2,000/2,000 steps, return 3.0, 100 steps/s, 0:00:00 left"
     )
-
-
-def test_steps_are_of_a_seed(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", -1.0)
-    with progress.Progress("hopper ppo", 10 * 30_720, 10) as shown:
-        shown.update(10 * 15_360, np.full((10, 2), np.nan))
-        shown.update(10 * 30_720, np.full((10, 2), 4.0))
-    half, end = capsys.readouterr().err.splitlines()
-    assert half.startswith("hopper ppo: 15,360/30,720 steps x 10 seeds, return (none")
-    assert end.startswith("hopper ppo: 30,720/30,720 steps x 10 seeds, return 4.0, ")
 
 
 def test_at_80_columns_only_the_bar_gives_way(monkeypatch):

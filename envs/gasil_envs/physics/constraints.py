@@ -8,7 +8,6 @@ Shape letters: C contacts, A axes (normal and tangents), V degrees of freedom, N
 B batch.
 """
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -114,29 +113,6 @@ def _constant(x: np.ndarray) -> np.ndarray:
     return x[:1] if len(x) and (x == x[:1]).all() else x
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Limits:
-    """The limits of L slide and hinge joints, in metres or radians.
-
-    Attributes:
-      qpos: int (L,), index of each joint in qpos.
-      dof: int (L,), index of its degree of freedom.
-      low: float32 (L or 1, 1), its lower limit.
-      high: float32 (L or 1, 1), its upper limit.
-      margin: float32 (L or 1, 1), distance to a limit below which the limit acts.
-      inverse_weight: float32 (L or 1, 1), MuJoCo's dof_invweight0.
-      impedance: the coefficients of the limits.
-    """
-
-    qpos: np.ndarray
-    dof: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-    margin: np.ndarray
-    inverse_weight: np.ndarray
-    impedance: Impedance
-
-
 class Constants(struct.PyTreeNode):
     """The constants of a group's contacts, (C or 1, ..., 1) each.
 
@@ -197,6 +173,26 @@ class Strength(NamedTuple):
         return cls(_constant(inverse_weight), Impedance.of(model, *solver), bound)
 
 
+class Limits(NamedTuple):
+    """The limits of L slide and hinge joints, in metres or radians.
+
+    Attributes:
+      qpos: int (L,), index of each joint in qpos.
+      dof: int (L,), index of its degree of freedom.
+      low: float32 (L or 1, 1), its lower limit.
+      high: float32 (L or 1, 1), its upper limit.
+      margin: float32 (L or 1, 1), distance to a limit below which the limit acts.
+      strength: that of the limits.
+    """
+
+    qpos: np.ndarray
+    dof: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    margin: np.ndarray
+    strength: Strength
+
+
 #: (nq, B) positions -> (n, B) how far n rows are from being held, and their Jacobians
 #: (n, V, B). Rows that only push act where that is negative.
 Residual = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
@@ -245,17 +241,15 @@ def unsupported(model: mujoco.MjModel) -> str | None:
 def layout(model: mujoco.MjModel) -> Layout:
     """Compute everything that does not depend on the state."""
     limited = np.flatnonzero(model.jnt_limited & (model.jnt_type != tree.BALL))
-    dof = model.jnt_dofadr[limited]
+    dof, solver = model.jnt_dofadr[limited], (model.jnt_solref, model.jnt_solimp)
+    low, high = map(_constant, model.jnt_range[limited].T)
     limits = Limits(
-        qpos=model.jnt_qposadr[limited],
-        dof=dof,
-        low=_constant(model.jnt_range[limited, 0]),
-        high=_constant(model.jnt_range[limited, 1]),
-        margin=_constant(model.jnt_margin[limited]),
-        inverse_weight=_constant(model.dof_invweight0[dof]),
-        impedance=Impedance.of(
-            model, model.jnt_solref[limited], model.jnt_solimp[limited]
-        ),
+        model.jnt_qposadr[limited],
+        dof,
+        low,
+        high,
+        _constant(model.jnt_margin[limited]),
+        Strength.of(model, model.dof_invweight0[dof], [x[limited] for x in solver]),
     )
     contact = candidates.candidates(model)
     normal = motion_normal(model, contact.geoms)
@@ -268,9 +262,8 @@ def layout(model: mujoco.MjModel) -> Layout:
         if (contact.dim == dim).any()
     ]
     friction = None
-    if model.dof_frictionloss.any():
+    if (loss := model.dof_frictionloss).any():
         solver = model.dof_solref, model.dof_solimp
-        loss = model.dof_frictionloss
         friction = Strength.of(model, model.dof_invweight0, solver, loss)
     kinds = (_equalities, _tendon_friction, _tendon_limits, _ball_limits)
     others = tuple(rows for kind in kinds if (rows := kind(model)) is not None)
@@ -393,7 +386,7 @@ def _weight(
 
 
 @jax.named_scope("constraint_rows")
-def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.LimitRows:
+def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.JointRows:
     """Return the limits of all degrees of freedom at qpos (nq, B) and qvel (V, B)."""
     joint = take(qpos, limits.qpos)
     above_low, below_high = joint - limits.low, limits.high - joint
@@ -401,15 +394,16 @@ def limit_rows(limits: Limits, qpos: jax.Array, qvel: jax.Array) -> newton.Limit
     inside = jnp.where(above_low < below_high, 1.0, -1.0)
     sign = jnp.where(distance < 0.0, inside, 0.0)
     distance = jnp.minimum(distance, 0.0)
-    impedance = limits.impedance(distance)
-    pull = limits.impedance.stiffness * impedance * distance
-    damp = limits.impedance.damping * sign * take(qvel, limits.dof)
-    of_limit = (sign, -damp - pull, _weight(impedance, limits.inverse_weight))
+    inverse_weight, solimp, _ = limits.strength
+    impedance = solimp(distance)
+    pull = solimp.stiffness * impedance * distance
+    damp = solimp.damping * sign * take(qvel, limits.dof)
+    of_limit = (sign, -damp - pull, _weight(impedance, inverse_weight))
     # Put each limit at the index of its degree of freedom, without a scatter.
     index = np.full(qvel.shape[0], limits.dof.size)
     index[limits.dof] = np.arange(limits.dof.size)
     none = jnp.zeros((1, qvel.shape[1]), jnp.float32)
-    return newton.LimitRows(
+    return newton.JointRows(
         *(take(jnp.concatenate([x, none]), index) for x in map(materialize, of_limit))
     )
 
@@ -514,18 +508,16 @@ def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     return Strength.of(model, weight, solver), residual
 
 
-def friction_rows(
-    friction: Strength | None, qvel: jax.Array
-) -> newton.FrictionRows | None:
+def friction_rows(friction: Strength, qvel: jax.Array) -> newton.JointRows:
     """Return the dry friction of the degrees of freedom at qvel (V, B)."""
-    if friction is None or friction.bound is None:
-        return None
-    impedance = friction.impedance(jnp.zeros_like(qvel))
-    weight = _weight(impedance, friction.inverse_weight)
-    return newton.FrictionRows(
-        reference=jnp.asarray(-friction.impedance.damping) * qvel,
-        weight=jnp.where(friction.bound > 0, weight, 0.0),
-        bound=jnp.broadcast_to(friction.bound, qvel.shape),
+    inverse_weight, solimp, most = friction
+    weight = _weight(solimp(jnp.zeros_like(qvel)), inverse_weight)
+    bound = jnp.broadcast_to(jnp.asarray(most), qvel.shape)
+    return newton.JointRows(
+        sign=jnp.ones_like(qvel),
+        reference=jnp.asarray(-solimp.damping) * qvel,
+        weight=jnp.where(bound > 0, weight, 0.0),
+        bound=bound,
     )
 
 

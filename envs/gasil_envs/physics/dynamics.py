@@ -195,7 +195,9 @@ def forward(
         )
         for x in groups
     ]
-    limits = constraints.limit_rows(dynamics.layout.limits, qpos, qvel)
+    joints = [constraints.limit_rows(dynamics.layout.limits, qpos, qvel)]
+    if dynamics.layout.friction is not None:
+        joints.append(constraints.friction_rows(dynamics.layout.friction, qvel))
     others = [
         constraints.other_rows(*x, qpos, qvel=qvel) for x in dynamics.layout.others
     ]
@@ -210,9 +212,8 @@ def forward(
             smooth.inertia,
             force,
             state.qacc_warmstart,
-            limits,
+            tuple(joints),
             (*rows, *others),
-            constraints.friction_rows(dynamics.layout.friction, qvel),
         )
         solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)
@@ -338,11 +339,17 @@ def _euler(
             of_qvel = dynamics.tendons.of_qvel
             constant = constant + of_qvel.T @ (model.tendon_damping[:, None] * of_qvel)
         damping: Any = (dt * constant).astype(np.float32)[..., None]
-        if implicitfast and not own.are_motors:
+        of_servos = implicitfast and not own.are_motors
+        if of_servos:
             damping = damping + dt * actuators.damping(
                 own, actuation, state.qpos, qvel=state.qvel
             )
-        qacc = solver.eliminate(now.inertia + damping, now.force)
+        if dynamics.presses and (of_servos or constant.any()):
+            # Large forces that balance each other are not added again.
+            lost = total(damping * qacc, 1)
+            qacc = qacc - solver.eliminate(now.inertia + damping, lost)
+        elif of_servos or constant.any():
+            qacc = solver.eliminate(now.inertia + damping, now.force)
     qvel = state.qvel + dt * qacc
     qpos = _integrate_positions(model, state.qpos, qvel)
     return PhysicsState(qpos, qvel, now.qacc), now.fields

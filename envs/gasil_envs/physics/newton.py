@@ -11,7 +11,7 @@ active rows. Most rows are one-sided, as here: they only push. Those of dry fric
 of equalities pull as well, with a force D_r (J_r qacc - aref_r) up to a bound, which is
 infinite for an equality; beyond it the cost is linear.
 
-Rows are not stored one by one. A joint's limit is one entry of a diagonal. The rows
+Rows are not stored one by one. A joint's is one entry of a diagonal. The rows
 of a contact are the edges of its friction pyramid, normal +- friction * tangent: with
 E the small constant matrix that makes edges of normal and tangents, J = E B, and
 
@@ -59,32 +59,21 @@ class ContactRows(struct.PyTreeNode):
     bound: jax.Array | None = None
 
 
-class LimitRows(struct.PyTreeNode):
-    """The rows of joint limits, at most one for each degree of freedom; float32.
+class JointRows(struct.PyTreeNode):
+    """Rows of one degree of freedom each, its limit or its dry friction; float32.
 
     Attributes:
-      sign: (V,), the Jacobian: 1 at a lower, -1 at an upper limit, 0 in between.
+      sign: (V,), the Jacobian: 1 of friction and at a lower limit, -1 at an upper one,
+        0 in between.
       reference: (V,), aref.
       weight: (V,), D, at least 0.
+      bound: (V,), largest force of friction; None of limits, which only push.
     """
 
     sign: jax.Array
     reference: jax.Array
     weight: jax.Array
-
-
-class FrictionRows(struct.PyTreeNode):
-    """The rows of dry friction in the degrees of freedom; float32.
-
-    Attributes:
-      reference: (V,), aref.
-      weight: (V,), D; 0 where there is no friction.
-      bound: (V,), largest force.
-    """
-
-    reference: jax.Array
-    weight: jax.Array
-    bound: jax.Array
+    bound: jax.Array | None = None
 
 
 class Problem(struct.PyTreeNode):
@@ -94,17 +83,15 @@ class Problem(struct.PyTreeNode):
       inertia: (V, V), the joint-space inertia M.
       force: (V,), all forces but the constraints': M qacc_smooth.
       warmstart: (V,), initial guess, used if it is better than qacc_smooth.
-      limits: the limits of the joints.
+      joints: the joints' limits, and their dry friction if there is any.
       contacts: groups of contacts, and of other rows as contacts with one axis.
-      friction: dry friction, if there is any.
     """
 
     inertia: jax.Array
     force: jax.Array
     warmstart: jax.Array
-    limits: LimitRows
+    joints: tuple[JointRows, ...]
     contacts: tuple[ContactRows, ...] = ()
-    friction: FrictionRows | None = None
 
 
 class Solution(struct.PyTreeNode):
@@ -258,6 +245,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
     each = jax.tree.map
     # A row that bends twice can send a search from one end to the other for ever.
     pulls = any(most is not None for most in system.bound)
+    thorough = pulls or line_search > 4
 
     def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
         """Return a function of each row; `others` are the last arguments."""
@@ -318,8 +306,9 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
                 inside &= jnp.abs(following - other_end) > 0.01 * (high - low)
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
-            # Newton's step within one piece is the last; half of the way is none.
-            goes_on = system.differ((before, is_newton), (now, is_newton | True))
+            goes_on = system.differ(before, now)
+            if thorough:  # Half of the way is no step to end with.
+                goes_on |= system.differ(is_newton, is_newton | True)
             return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)

@@ -5,6 +5,7 @@ vector units.
 """
 
 import functools
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -97,8 +98,8 @@ def eliminate(matrix: jax.Array, right: jax.Array) -> jax.Array:
 class _Batch:
     """A batch of problems, a `newton.System`.
 
-    A vector is (V, B). Rows are a list: (V, B) for the limits, (E, C, B) for each group
-    of contacts, and (V, B) for dry friction if there is any.
+    A vector is (V, B). Rows are a list: (V, B) for each of the joints' rows, then
+    (E, C, B) for each group of contacts.
     """
 
     def __init__(self, problem: newton.Problem, for_speed: bool):
@@ -109,23 +110,18 @@ class _Batch:
             entries = matrix.shape[0] * matrix.shape[1]
             return for_speed and entries <= _MOST_ENTRIES_SPELLED_OUT
 
-        limits, contacts = problem.limits, problem.contacts
+        joints, contacts = problem.joints, problem.contacts
         self.force, self.warmstart = problem.force, problem.warmstart
-        self.reference = [limits.reference]
+        self.reference = [x.reference for x in joints]
         self.reference += [edges_first(group.reference) for group in contacts]
-        self.weight = [limits.weight]
+        self.weight = [x.weight for x in joints]
         self.weight += [edges_first(group.weight) for group in contacts]
-        self.bound: list[Any] = [None]
+        self.bound = [x.bound for x in joints]
         self.bound += [
             None if group.bound is None else edges_first(group.bound)
             for group in contacts
         ]
-        self._has_friction = problem.friction is not None
-        if problem.friction is not None:
-            self.reference.append(problem.friction.reference)
-            self.weight.append(problem.friction.weight)
-            self.bound.append(problem.friction.bound)
-        self._inertia, self._sign = problem.inertia, limits.sign
+        self._inertia, self._signs = problem.inertia, [x.sign for x in joints]
         self._edges = [group.edges for group in contacts]
         self._shapes = [group.basis.shape[:2] for group in contacts]
         # B has, group after group, the normals, the first and the second tangents.
@@ -147,23 +143,16 @@ class _Batch:
         return _matvec(self._inertia, vector, self._spell_out_inertia)
 
     def times(self, vector: jax.Array) -> list[jax.Array]:
-        result = [self._sign * vector]
+        result = [sign * vector for sign in self._signs]
         if self._basis is not None:
             along = self._split(_matvec(self._basis, vector, self._spell_out))
             for edges, axes in zip(self._edges, along, strict=True):
                 result.append(jnp.stack([sum_signed(axes, signs) for signs in edges]))
-        return [*result, vector] if self._has_friction else result
-
-    def _parts(self, rows: list[jax.Array]) -> tuple[Any, list[Any], list[Any]]:
-        """Return the rows of the limits, of the groups and of friction."""
-        last = len(self._edges) + 1
-        return rows[0], rows[1:last], rows[last:]
+        return result
 
     def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
-        of_limits, of_groups, friction = self._parts(rows)
-        result = self._sign * of_limits
-        for of_friction in friction:
-            result = result + of_friction
+        result = add(map(operator.mul, self._signs, rows))
+        of_groups = rows[len(self._signs) :]
         if self._basis is None:
             return result
         along = [
@@ -181,10 +170,8 @@ class _Batch:
 
     def _gram(self, weights: list[jax.Array]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""
-        of_limits, of_groups, friction = self._parts(weights)
-        diagonal = self._sign**2 * of_limits
-        for of_friction in friction:
-            diagonal = diagonal + of_friction
+        diagonal = add(sign**2 * x for sign, x in zip(self._signs, weights))
+        of_groups = weights[len(self._signs) :]
         result = jnp.eye(diagonal.shape[0])[:, :, None] * diagonal
         if self._basis is None:
             return result
@@ -246,8 +233,6 @@ def solve_many(
     qacc, forces = newton.minimize(batch, iterations, line_search)
     return newton.Solution(
         qacc=qacc,
-        edge_forces=tuple(
-            jnp.swapaxes(x, 0, 1) for x in forces[1 : len(problem.contacts) + 1]
-        ),
+        edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in forces[len(problem.joints) :]),
         constraint_force=batch.transposed_times(forces),
     )

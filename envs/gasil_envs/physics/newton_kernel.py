@@ -9,7 +9,8 @@ because that leaves registers.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+import operator
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -137,30 +138,41 @@ def _store_vector(ref: Any, vector: list[jax.Array]) -> None:
         ref[i * WIDTH : (i + 1) * WIDTH] = part
 
 
+def _multiply(a: list[jax.Array], b: list[jax.Array]) -> list[jax.Array]:
+    """Return the product of two vectors, entry by entry."""
+    return list(map(operator.mul, a, b))
+
+
+def _sum(vectors: Iterable[list[jax.Array]]) -> list[jax.Array]:
+    return [add(parts) for parts in zip(*vectors, strict=True)]
+
+
 class _Block:
     """One problem, a `newton.System`.
 
-    Rows are a list: a vector for the limits, a list of E arrays (C,) for each group of
-    contacts, and a vector for dry friction if there is any.
+    Rows are a list: a vector for each of the joints' rows, then a list of E arrays (C,)
+    for each group of contacts.
     """
 
     def __init__(self, refs: Any, size: int, edges: Sequence[Any], counts: Any) -> None:
         """Load a problem.
 
         Args:
-          refs: references to the inertia, the five vectors of a problem and three more
-            of friction, and for each group to its axes (C, V) and its edges'
-            references, weights and bounds (C,).
+          refs: references to the inertia, the force and the warm start, the vectors of
+            each of the joints' rows, and for each group to its axes (C, V) and its
+            edges' references, weights and bounds (C,).
           size: number of degrees of freedom.
           edges: each group's edges.
           counts: each group's contacts.
         """
-        inertia, vectors, groups = refs
-        loaded = [_load_vector(ref, size) for ref in vectors]
-        self.force, self.warmstart, self._sign, reference, weight = loaded[:5]
-        self.reference: list[Any] = [reference]
-        self.weight: list[Any] = [weight]
-        self.bound: list[Any] = [None]
+        inertia, vectors, joints, groups = refs
+        self.force, self.warmstart = (_load_vector(ref, size) for ref in vectors)
+        loaded = [[_load_vector(ref, size) for ref in rows] for rows in joints]
+        self.signs = [rows[0] for rows in loaded]
+        self.reference: list[Any] = [rows[1] for rows in loaded]
+        self.weight: list[Any] = [rows[2] for rows in loaded]
+        # Those of limits have no bound.
+        self.bound: list[Any] = [(*rows, None)[3] for rows in loaded]
         self._size, self._edges = size, edges
         self._inertia = _loads_of_matrix(inertia, size)
         # For each group a list of axes, each a list of parts (C, W).
@@ -182,13 +194,6 @@ class _Block:
                 ]
             )
 
-        self._has_friction = len(loaded) > 5
-        if self._has_friction:
-            for rows, of_friction in zip(
-                (self.reference, self.weight, self.bound), loaded[5:], strict=True
-            ):
-                rows.append(of_friction)
-
     def inertia_times(self, vector: list[jax.Array]) -> list[jax.Array]:
         result = []
         for i, row in enumerate(self._inertia):
@@ -204,25 +209,18 @@ class _Block:
         return result
 
     def times(self, vector: list[jax.Array]) -> list[Any]:
-        rows: list[Any] = [jax.tree.map(jnp.multiply, self._sign, vector)]
+        rows: list[Any] = [_multiply(sign, vector) for sign in self.signs]
         for edges, axes in zip(self._edges, self._basis, strict=True):
             along = [
                 add(_matvec(part(), x) for part, x in zip(parts, vector, strict=True))
                 for parts in axes
             ]
             rows.append([sum_signed(along, signs) for signs in edges])
-        return [*rows, vector] if self._has_friction else rows
-
-    def _parts(self, rows: list[Any]) -> tuple[Any, list[Any]]:
-        """Return the diagonal rows, of the limits and friction, and the groups'."""
-        last = len(self._edges) + 1
-        return [rows[0], *rows[last:]], rows[1:last]
+        return rows
 
     def transposed_times(self, rows: list[Any]) -> list[jax.Array]:
-        (of_limits, *friction), of_groups = self._parts(rows)
-        result = jax.tree.map(jnp.multiply, self._sign, of_limits)
-        for vector in friction:
-            result = jax.tree.map(jnp.add, result, vector)
+        result = _sum(map(_multiply, self.signs, rows))
+        of_groups = rows[len(self.signs) :]
         for edges, axes, of_edges in zip(
             self._edges, self._basis, of_groups, strict=True
         ):
@@ -243,11 +241,10 @@ class _Block:
 
     def _add_gram(self, matrix: Matrix, weights: list[Any]) -> None:
         """Add J' diag(weights) J."""
-        (of_limits, *friction), of_groups = self._parts(weights)
         diagonal = _iota((WIDTH, WIDTH), 0) == _iota((WIDTH, WIDTH), 1)
-        own = jax.tree.map(lambda sign, x: sign**2 * x, self._sign, of_limits)
-        for vector in friction:
-            own = jax.tree.map(jnp.add, own, vector)
+        squares = [_multiply(sign, sign) for sign in self.signs]
+        own = _sum(map(_multiply, squares, weights))
+        of_groups = weights[len(self.signs) :]
         for row, entry in zip(matrix, own, strict=True):
             entries = jnp.broadcast_to(entry[:, None], diagonal.shape)
             row[0] = row[0] + jnp.where(diagonal, entries, 0.0)
@@ -310,7 +307,7 @@ def _newton(
     qacc, forces = newton.minimize(block, iterations, line_search)
     for ref, vector in zip(results, (qacc, block.transposed_times(forces))):
         _store_vector(ref, vector)
-    of_groups = forces[1 : len(results[2]) + 1]
+    of_groups = forces[len(block.signs) :]
     for refs, of_edges in zip(results[2], of_groups, strict=True):
         for ref, force in zip(refs, of_edges, strict=True):
             ref[...] = force
@@ -383,11 +380,9 @@ def solve_many(
 
     With `interpret` the kernel runs as XLA's operations, on any device, to test it.
     """
-    size, limits = problem.force.shape[0], problem.limits
+    size = problem.force.shape[0]
     padded = len(_parts(size)) * WIDTH
-    vectors = [problem.force, problem.warmstart]
-    vectors += [limits.sign, limits.reference, limits.weight]
-    vectors += jax.tree.leaves(problem.friction)
+    joints = list(map(jax.tree.leaves, problem.joints))
     counts = [len(group.basis) for group in problem.contacts]
     groups, of_groups, of_edges, entries = [], [], [], 0
     for group, count in zip(problem.contacts, counts, strict=True):
@@ -409,8 +404,13 @@ def solve_many(
     vector = _spec(padded)
     qacc, constraint_force, forces = _call(
         functools.partial(_newton, read, iterations, line_search),
-        (problem.inertia, vectors, groups),
-        (_spec(padded, padded), [vector] * len(vectors), of_groups),
+        (problem.inertia, [problem.force, problem.warmstart], joints, groups),
+        (
+            _spec(padded, padded),
+            [vector] * 2,
+            [[vector] * len(rows) for rows in joints],
+            of_groups,
+        ),
         [vector, vector, of_edges],
         warps=1 << max(0, (entries // _ENTRIES_OF_A_WARP).bit_length() - 1),
         interpret=interpret,

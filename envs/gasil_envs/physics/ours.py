@@ -78,7 +78,8 @@ class JaxPhysics:
         )
         if self.warnings:
             _LOGGER.warning(
-                "physics 'jax' may differ from C MuJoCo's by 1e-3 in this model's %s",
+                "physics 'jax' may differ from C MuJoCo's by 1e-3 a step, more where "
+                "stiff contacts oppose each other, in this model's %s",
                 ", ".join(self.warnings),
             )
 
