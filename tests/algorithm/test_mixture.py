@@ -157,3 +157,24 @@ def test_a_saved_policy_acts_as_the_network(tmp_path):
     ):
         np.testing.assert_allclose(drawn.mean(axis=0), center, atol=0.03)
         np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(variance), rtol=0.03)
+
+
+def test_a_component_is_drawn_by_its_weight():
+    mean = np.array([[-50.0, 5.0], [50.0, 5.0], [0.0, -80.0]])
+    log_std, logits = np.log([0.5, 2.0]), np.log([0.5, 0.3, 0.2])
+    tiled = np.tile(mean, (20_000, 1, 1)), log_std, np.tile(logits, (20_000, 1))
+    drawn = np.asarray(MIXTURE.sample(jax.random.key(0), given(tiled)))
+    nearest = np.abs(drawn[:, None] - mean).sum(axis=-1).argmin(axis=1)
+    share = np.bincount(nearest, minlength=3) / 20_000
+    np.testing.assert_allclose(share, [0.5, 0.3, 0.2], atol=0.015)
+    within = (drawn - mean[nearest]).std(axis=0)
+    np.testing.assert_allclose(within, [0.5, 2.0], rtol=0.03)
+
+
+def test_far_from_all_components_the_density_is_finite():
+    parameters = given(draw())
+    distant = jnp.full((5, 3), 1e3)
+    log_prob = lambda x: MIXTURE.log_prob(x, distant).sum()
+    value, gradient = jax.jit(jax.value_and_grad(log_prob))(parameters)
+    for x in (value, *gradient):
+        assert np.isfinite(x).all()

@@ -12,14 +12,16 @@ from experiments import (
     claims,
     comparisons,
     doing_nothing,
+    figure_results,
     plots,
     report,
+    search,
     tables,
 )
-from experiments.curves import Curve, Figure, grid
+from experiments.curves import Arm, Curve, Figure, grid
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.search import solved_from
+from experiments.search import SparseSearch, solved_from
 from experiments.store import RESULTS, Record, Store
 from gasil_jax import presets
 from gasil_jax.errors import InputError
@@ -221,8 +223,67 @@ def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words):
     assert claims.verdict(pages, None) == ""
 
 
+def test_the_mean_over_tasks_stands_beside_them(tmp_path, monkeypatch):
+    units = {"hopper": 1000.0, "swimmer": 50.0, "ant": 10.0}
+    monkeypatch.setattr(figure_results, "unit", lambda env, store: units[env])
+    arms = ["ppo", "ppo+bc", Arm("more", "ppo+gasil")]
+    panels = grid([*units], arms, base=None, seeds=6)
+    store = Store(tmp_path / "runs")
+    for panel, curves in panels.items():
+        for i, curve in enumerate(curves.values()):
+            runs = curve.runs(store)
+            store.add(dict.fromkeys(runs, constant(units[panel] * (1 + i))))
+    results = Results("x", Figure("", "", panels, favourite="more"), store)
+    whole = results.whole([*units])
+    assert [x[0] for x in whole.values()] == [1.0, 2.0, 3.0]
+    *drawn, last = [x for x in plots.curves(results).axes if x.get_visible()]
+    assert [x.get_title() for x in drawn] == [*units]
+    assert [x.get_text() for x in last.texts] == [*whole]
+    # Panels that share a task have no mean.
+    assert not results.whole(["hopper", "hopper", "ant"])
+
+
+def test_one_point_is_chosen_for_all_sparse_tasks(tmp_path):
+    store = Store(tmp_path)
+    one = SparseSearch(search.SPARSE_SEARCHED[0], "ppo")
+    good = one.points(store)[3]
+    for env in search.SPARSE_SEARCHED:
+        assert one.best(store) is None
+        own = dataclasses.replace(one, env=env)
+        best = {
+            x: solved_from(env) * (x.algorithm == own.algorithm(good))
+            for x in own.requested(store)
+        }
+        store.add({run: constant(value) for run, value in best.items()})
+    point, progress = one.best(store)
+    assert point == good and (progress == 1.0).all()
+    # Other tasks, with noise for example, get the same point.
+    assert SparseSearch("sparse:u_maze_noisy", "ppo").chosen(store) == good
+    sizes = {len(SparseSearch("", x).points(store)) for x in search.SPARSE_SPACES}
+    assert sizes == {6}
+
+
+#: What may stand in a note in digits: settings, and names.
+_SETTINGS = (
+    *("walker2d", "`[^`]*`", "[Ff]igures? [2-8](?: (?:and|to) [2-8])?", r"\dM steps"),
+    *("table 1", r"to 0\.02 at 3M", "is 0 until", '"from-2M"', r"\b20 steps", "95%"),
+    *("delay 10*", "delay of 1000", "delay 20", r"alpha 0\.02", "32\\s+environments"),
+    *("30,000 steps", "128 drawn", "1,000 steps", "buffer of 500", "1: PPO"),
+)
+_NOTES = {x.stem: x.read_text() for x in sorted(report.NOTES.glob("*.md"))}
+
+
+@pytest.mark.parametrize("name", _NOTES)
+def test_no_number_of_a_note_is_typed_by_hand(name):
+    """Every digit is of a slot, or of a setting."""
+    rest = re.sub(r"{{.+?}}|\]\(.+?\)", "", _NOTES[name])
+    for setting in _SETTINGS:
+        rest = re.sub(setting, "", rest)
+    assert not re.findall(r".*\d.*", rest)
+
+
 def test_no_verdict_of_a_note_is_typed_by_hand():
     words = r"\b(better than|worse than|clearly|outperforms|ahead of)\b"
-    for path in report.NOTES.glob("*.md"):
-        text = " ".join(re.sub(r"{{.+?}}", "", path.read_text()).split())
-        assert not re.findall(words, text), path
+    for name, note in _NOTES.items():
+        text = " ".join(re.sub(r"{{.+?}}", "", note).split())
+        assert not re.findall(words, text), name

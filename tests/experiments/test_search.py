@@ -13,7 +13,7 @@ from experiments.search import (
     Search,
     SingleSetting,
 )
-from experiments.store import Record, Store
+from experiments.store import RESULTS, Record, Store
 
 
 def fill(store, one, points, scores, seeds=(1000, 1001)):
@@ -117,3 +117,21 @@ def test_the_papers_protocol_has_the_appendix_s_values():
         for name, values in search.PAPER_SPACES[agent].items():
             counts = collections.Counter(point[name] for point in points)
             assert set(counts) == set(values) and len(set(counts.values())) == 1
+    one = search.PaperSearch("hopper", "ppo+gasil", 20)
+    for runs in one.runs(one.points(Store(RESULTS / "runs"))):
+        assert [run.seed for run in runs] == [1000, 1001]
+        algorithm, config = runs[0].algorithm, runs[0].algorithm.config
+        assert (config.num_envs, config.num_steps) == (1, 2048)
+        assert algorithm.settings["normalize_rewards"] and not config.stagger_episodes
+        assert (config.num_epochs, config.minibatch_size) == (10, 64)
+        assert (config.gamma, config.gae_lambda) == (0.99, 0.95)
+        assert config.initial_std == 1.0 and config.entropy_coefficient == 0.0
+
+
+def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
+    store, one = Store(tmp_path), search.PaperSearch("hopper", "ppo", 20)
+    raw = search.PaperSearch("hopper", "ppo", 20, normalize_rewards=False)
+    assert one.best(store) is None
+    fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
+    assert one.chosen(store) == {"learning_rate": 5e-5}
+    assert not store.missing(one.requested(store)) and raw.chosen(store) is None

@@ -2,6 +2,7 @@
 
 import functools
 import io
+import threading
 import time
 
 import numpy as np
@@ -35,6 +36,15 @@ def test_a_long_phase_says_for_how_long_it_has(monkeypatch, capsys):
         while text.count("\n") < 2 and time.monotonic() < deadline:
             text += wait_for_text(capsys)
     assert text.startswith("hopper: compiling\nhopper: compiling (0 s)\n")
+
+
+def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_ANNOUNCEMENT", 600.0)
+    before = threading.active_count()
+    with progress.announced("hopper", "building"):
+        assert threading.active_count() == before + 1
+    assert threading.active_count() == before
+    assert capsys.readouterr().err == ""
 
 
 def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
