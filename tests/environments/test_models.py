@@ -197,8 +197,9 @@ def test_where_mjx_is_not_mujoco_is_told(xml, what):
         (MODELS["no friction"], "contacts, which are 1e+05 times as stiff"),
         (MODELS["trees far apart"], "bodies 100 m from the origin"),
         (
-            drop(world='<body pos="8 0 0"><freejoint/><geom size="1e-3"/></body>'),
-            "bodies 8 m from the origin",
+            "<mujoco><worldbody><body pos='1 0 0'><freejoint/><geom size='5e-3'/>"
+            "</body></worldbody></mujoco>",
+            "bodies 1 m from the origin",
         ),
         (
             arms().replace(
