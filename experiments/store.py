@@ -6,6 +6,7 @@ trained.
 """
 
 import dataclasses
+import functools
 import json
 import pathlib
 from collections.abc import Iterable, Mapping
@@ -16,13 +17,36 @@ import numpy as np
 from experiments.agents import OWN
 from gasil_jax import npz
 from gasil_jax.errors import InputError
-from gasil_jax.host import folders, output_file
-from gasil_jax.host.runs import Run, read_run
+from gasil_jax.host import descriptions, folders, json_files, output_file
+from gasil_jax.host.environments import Settings
+from gasil_jax.host.runs import Run
 
 _NONE = np.empty(0)
-#: The names of agents in files, and those of their classes, where they differ.
+#: The names of agents and of settings in files, where they differ from the package's.
+#: So a rename needs no migration, and stored runs stay as they are.
 _STORED = {agent.name: name for name, agent in OWN.items()}
-_CURRENT = {name: agent for agent, name in _STORED.items()}
+_STORED |= {"initial_std": "initial_deviation"}
+_CURRENT = {stored: name for name, stored in _STORED.items()}
+#: Settings that are newer than stored runs, with what those had, which is the default.
+#: With this value they are left out of a file.
+NEWER: Mapping[str, Any] = {
+    "max_episode_steps": None,
+    "observe_phase": False,
+    "action_noise": 0.0,
+    "policy_components": 1,
+    "rewards": [],
+}
+#: Settings that are no more: those beside which a run had one, and what all had.
+_REMOVED: Mapping[str, tuple[tuple[str, ...], Any]] = {
+    "value_coefficient": (("learning_rate",), 1.0),
+    "admission": (("buffer_steps",), "all"),
+    "ties": (("buffer_steps",), "oldest"),
+    "sample_by_return": (("buffer_steps",), False),
+    "buffer_discounts": (("buffer_steps",), True),
+    "novelty_ties": (("buffer_steps", "novelty_cell"), "novel"),
+    "discriminator_gradient_penalty": (("bonus",), 0.0),
+    "discriminator_normalizes_actions": (("bonus",), False),
+}
 RESULTS = pathlib.Path(__file__).parent / "results"
 
 
@@ -92,33 +116,61 @@ def _rounded(name: str, values: np.ndarray) -> np.ndarray:
 
 def to_stored(experiment: str) -> dict[str, Any]:
     """Return a `Run.experiment` as it stands in a file."""
-    return _renamed(json.loads(experiment), _STORED)
+
+    def old(fields: Mapping[str, Any]) -> dict[str, Any]:
+        kept = {x: y for x, y in fields.items() if x not in NEWER or y != NEWER[x]}
+        return {_STORED.get(x, x): y for x, y in kept.items()}
+
+    fields = json.loads(experiment)
+    settings = fields["algorithm"]
+    agent = _STORED.get(settings["agent"], settings["agent"])
+    algorithm = {**old(settings), **_removed(settings), "agent": agent}
+    return {**old(fields), "algorithm": algorithm}
 
 
 def from_stored(fields: Mapping[str, Any], seed: int = 0) -> Run:
     """Return the run of an experiment in a file."""
-    return read_run(_renamed(fields, _CURRENT), seed)
+    others = dict(fields)
+    own = {name: others.pop(name) for name in ("env", "algorithm_version")}
+    settings = {_CURRENT.get(x, x): y for x, y in others.pop("algorithm").items()}
+    settings["agent"] = _CURRENT.get(settings["agent"], settings["agent"])
+    for name, value in _removed(settings).items():
+        if settings.pop(name, value) != value:
+            raise InputError(f"{name} is not {value!r}: this setting is no more")
+    algorithm = descriptions.read(settings)
+    environment = json_files.as_type(Settings, others, "settings")
+    return Run(algorithm=algorithm, seed=seed, settings=environment, **own)
 
 
-def _renamed(fields: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, Any]:
-    settings = fields["algorithm"]
-    agent = names.get(settings["agent"], settings["agent"])
-    return {**fields, "algorithm": {**settings, "agent": agent}}
+def _removed(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings that stood beside others and are no more."""
+    return {
+        name: value
+        for name, (beside, value) in _REMOVED.items()
+        if settings.keys() >= {*beside}
+    }
+
+
+@functools.cache
+def _text(experiment: str) -> str:
+    return json.dumps(to_stored(experiment), sort_keys=True)
 
 
 def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
     """Write a file of runs; its bytes do not depend on the order of the runs."""
-    ordered = sorted(records, key=lambda run: (run.experiment, run.seed))
+    ordered = sorted(records, key=lambda run: (_text(run.experiment), run.seed))
     provenance = {x: json.dumps(records[x].provenance, sort_keys=True) for x in ordered}
-    experiments = sorted({run.experiment for run in ordered})
+    experiments = sorted({_text(run.experiment) for run in ordered})
     provenances = sorted(set(provenance.values()))
     index = {
-        "experiments": list(map(to_stored, experiments)),
+        "experiments": list(map(json.loads, experiments)),
         "provenances": list(map(json.loads, provenances)),
     }
     arrays = {
         "index": np.array(json.dumps(index, sort_keys=True)),
-        "experiment": np.array([experiments.index(run.experiment) for run in ordered]),
+        "experiment": np.array(
+            [experiments.index(_text(run.experiment)) for run in ordered]
+        ),
         "provenance": np.array([provenances.index(provenance[run]) for run in ordered]),
         "seed": np.array([run.seed for run in ordered], np.uint32),
     }

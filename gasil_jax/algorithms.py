@@ -163,7 +163,7 @@ def algorithm(agent: str = "ppo+gasil", **settings: Any) -> Algorithm:
 
 #: Columns of a sweep's tables, whose names no setting may have.
 _COLUMNS = frozenset(
-    "point seed mean worst_seed diverged diverged_seeds final_return final_length "
+    "point seed mean diverged diverged_seeds final_return final_length "
     "final_evaluation agent".split()
 )
 

@@ -182,22 +182,6 @@ def _activate(weights: Mapping[str, Any], x: Any, layer: int, xp: Any) -> Any:
     return xp.tanh(x)
 
 
-def probabilities(weights: Mapping[str, Any], observation: Any) -> np.ndarray:
-    """Return the probability of each discrete action, (..., action).
-
-    Raises:
-      ValueError: as in `output`, or if the policy's actions are not discrete.
-    """
-    if not is_discrete(weights):
-        raise ValueError(
-            "the policy's actions are not discrete, so they have no probabilities: use "
-            "numpy_policy.output for their mean"
-        )
-    logits = output(weights, observation)
-    exponentials = np.exp(logits - logits.max(axis=-1, keepdims=True))
-    return exponentials / exponentials.sum(axis=-1, keepdims=True)
-
-
 def load(
     path: str | pathlib.Path, seed: int | None = None
 ) -> Callable[..., np.ndarray]:

@@ -138,13 +138,16 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture
 def figures(monkeypatch):
-    """The figures that are saved in a test, instead of the files."""
-    import matplotlib.figure
+    """The figures that are saved in a test; their files are empty."""
+    from matplotlib.figure import Figure
 
     kept = []
-    monkeypatch.setattr(
-        matplotlib.figure.Figure, "savefig", lambda self, *_, **__: kept.append(self)
-    )
+
+    def keep(figure, path, **_):
+        kept.append(figure)
+        path.touch()
+
+    monkeypatch.setattr(Figure, "savefig", keep)
     return kept
 
 

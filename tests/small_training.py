@@ -1,5 +1,8 @@
 """A training that takes seconds, as settings and as flags, and policies of none."""
 
+import csv
+import pathlib
+
 import jax
 import numpy as np
 
@@ -52,3 +55,9 @@ def drawn_policies(env, algorithm, count, *, whole=False):
         actor_critic=states.actor_critic.replace(policy=learner),
         normalizer=jax.tree.map(lambda x: 1 + draw(x) ** 2, states.normalizer),
     )
+
+
+def table(path):
+    """The rows of a CSV file."""
+    with pathlib.Path(path).open() as file:
+        return list(csv.DictReader(file))

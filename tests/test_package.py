@@ -68,6 +68,23 @@ def test_help_imports_nothing_that_only_training_needs():
     assert not set(slow.split()) & set(result.stdout.split())
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("sys.platform = 'win32'", "runs on Linux and macOS: on Windows, use WSL"),
+        (
+            "importlib.metadata.version = lambda name: '0.10.2'",
+            "jaxlib 0.10.2 gives wrong numbers",
+        ),
+    ],
+)
+def test_where_it_cannot_run_the_import_says_so(change, message):
+    code = f"import importlib.metadata, sys; {change}; import gasil_jax"
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    last = ended.stderr.splitlines()[-1]
+    assert last.startswith("ImportError: ") and message in last
+
+
 def test_the_wheel_alone_trains(tmp_path):
     major = int(importlib.metadata.version("setuptools").partition(".")[0])
     if major < 77:

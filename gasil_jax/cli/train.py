@@ -99,7 +99,7 @@ def write(
 def tell(folder: pathlib.Path, told: Results, env: Any) -> None:
     """Print the scores, the speed, and commands to go on with."""
     if len(told.sweep.points) > 1:
-        print(*results.best_in_words(told), sep="\n")
+        print(results.best_in_words(told))
         scores = ""
     else:
         names = [x for x in ("final_return", "final_evaluation") if x in told.finals]

@@ -95,20 +95,14 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
 
 
 def _chain(error: BaseException | None) -> list[str]:
-    """Return the messages of an error and of those that led to it, the first one first.
-
-    Orbax cleans up behind its own failure, and that may fail in its turn.
-    """
+    """Return the messages of an error and of those that led to it, the first before."""
     if error is None:
         return []
     return [*_chain(error.__cause__ or error.__context__), str(error)]
 
 
 def _is_news(record: logging.LogRecord) -> bool:
-    """Return false for an operating system's error of a single array.
-
-    Orbax raises the first such error itself, so its threads need not log the others.
-    """
+    """Return false for the system's errors, of which Orbax raises the first itself."""
     return "os_error_code" not in record.getMessage()
 
 

@@ -106,7 +106,7 @@ class Outcome:
 class _Training:
     """Members in training."""
 
-    members: Members  # the members
+    members: Members
     # Their states, padded once training is compiled; None for the first ones.
     states: Any = None
     done: int = 0  # number of iterations so far
@@ -149,13 +149,7 @@ class _Training:
 
 
 class _Checkpoints:
-    """Writes the checkpoints of training, and decides when.
-
-    Args:
-      members: the members in training.
-      root: the folder of the checkpoints.
-      recording: says when, and how many are kept.
-    """
+    """Writes the checkpoints of training, and decides when."""
 
     def __init__(self, members: Members, root: pathlib.Path, recording: Recording):
         self._members, self._root = members, root

@@ -36,11 +36,13 @@ def announced(title: str, name: str, *, at_once: bool = False) -> Iterator[None]
             wait = _SECONDS_BETWEEN_ANNOUNCEMENTS
             text = str(activity)
 
-    threading.Thread(target=tell, daemon=True).start()
+    thread = threading.Thread(target=tell, daemon=True)
+    thread.start()
     try:
         yield
     finally:
         ended.set()
+        thread.join()
 
 
 def _line(title: str, text: str) -> None:

@@ -209,7 +209,6 @@ def _summary(results: Results) -> dict[str, Any]:
                 **estimate(
                     final[i] if np.isfinite(final[i]).all() else final[i][:0]
                 )._asdict(),
-                "worst_seed": finite(final[i].min()),
                 **{
                     name: finite(values[i].mean())
                     for name, values in results.finals.items()
@@ -220,7 +219,6 @@ def _summary(results: Results) -> dict[str, Any]:
             for i, point in enumerate(sweep.points)
         ],
         "best_by_mean": results.best(results.mean),
-        "best_by_worst_seed": results.best(final.min(axis=1)),
         "best_of_agents": _best_of_agents(results),
         **_speed(trainings),
         "versions": _joined([x["versions"] for x in trainings]),
@@ -270,22 +268,19 @@ def speed_in_words(trainings: Sequence[Training]) -> str:
     return f"{f'{steps:,.0f} steps/s ' if steps else ''}on {speed['device']}"
 
 
-def best_in_words(results: Results) -> list[str]:
-    """Return the lines that are printed of several points."""
-    lines, summary = [], results.summary
-    for key, name in (("mean", "best mean"), ("worst_seed", "best worst seed")):
-        told = "none, because every point has a seed that diverged or in which no "
-        told += "episode ended"
-        if (best := summary[f"best_by_{key}"]) is not None:
-            scores = summary["points"][best]
-            middle = Estimate(scores["interquartile_mean"], scores["interval"])
-            told = (
-                f"point {best}, {_labels(results)[best]}: mean {scores['mean']:.1f}, "
-            )
-            told += f"interquartile mean {middle}, worst seed "
-            told += f"{scores['worst_seed']:.1f}"
-        lines.append(f"{name}: {told}")
-    return lines
+def best_in_words(results: Results) -> str:
+    """Return what is printed of several points."""
+    if (best := results.summary["best_by_mean"]) is None:
+        return (
+            "best mean: none, because every point has a seed that diverged or in which "
+            "no episode ended"
+        )
+    scores = results.summary["points"][best]
+    middle = Estimate(scores["interquartile_mean"], scores["interval"])
+    return (
+        f"best mean: point {best}, {_labels(results)[best]}: mean "
+        f"{scores['mean']:.1f}, interquartile mean {middle}"
+    )
 
 
 def _labels(results: Results) -> list[str]:

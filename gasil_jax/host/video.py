@@ -149,14 +149,9 @@ def write_strip(
 
 
 class Videos:
-    """Films the policy of the first member at regular intervals of training.
+    """Films the policy of the first member, as STEPS.gif, also for the trackers.
 
     Training does not change by a single bit. What can't be drawn is a warning, once.
-
-    Args:
-      members: the members in training.
-      folder: where the films are written, STEPS.gif; the trackers get them too.
-      every: environment steps of a seed between two films.
 
     Attributes:
       interval: when to film, beside the final policy.

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.flatten_util import ravel_pytree
 from test_train import SMALL
 
 import gasil_jax
@@ -115,43 +114,3 @@ def test_the_bonus_is_added_to_the_reward_or_stands_in_its_place(agent, share):
     assert size > 0 and bonus.std() > 0.01
     expected = share * reward + 0.7 * bonus
     np.testing.assert_allclose(rewards, expected, rtol=1e-5, atol=1e-6)
-
-
-def test_a_form_that_does_not_exist_is_refused():
-    with pytest.raises(ValueError, match=r"bonus 'softmax' is unknown: .*softplus"):
-        gasil_jax.make_train(ENV, ADAPTIVE.replace(bonus="softmax"))
-    with pytest.raises(ValueError, match=r"imitation_rule 'bot' is unknown: .*'both'"):
-        gasil_jax.make_train(ENV, ADAPTIVE.replace(imitation_rule="bot"))
-
-
-@functools.cache
-def longer_context():
-    """The context of a first iteration that is long enough to fill a buffer."""
-    algorithm = SMALL["gasil"].replace(batch_steps=1024)
-    return jax.jit(lambda key: example_context(ENV, algorithm, key))(jax.random.key(0))
-
-
-@functools.cache
-def learned(**changes):
-    """GASIL's buffer, and unless it alone changes the discriminator's parameters."""
-    agent, key = SMALL["gasil"].agent.replace(buffer_steps=300), jax.random.key(0)
-    agent = agent.replace(**changes)
-    sizes = Sizes(ADAPTIVE.config.num_envs, ENV.observation_size, ENV.action_size)
-
-    @jax.jit
-    def first(context):
-        state = agent.remember(agent.init(key, sizes), context)
-        if any(name.startswith("buffer") for name in changes):
-            return state.buffer
-        after, *_ = agent.update_and_reward(state, context, key)
-        return state.buffer, ravel_pytree(after.discriminator.params)[0]
-
-    return first(longer_context())
-
-
-def test_options_of_buffer_and_discriminator_change_what_is_kept_and_learned():
-    plain, params = learned()
-    _, fewer = learned(discriminator_updates=1)
-    assert np.all(np.isfinite(fewer)) and not np.allclose(params, fewer, atol=1e-7)
-    assert learned(buffer_steps=150).size == 150 < plain.size
-    assert learned(buffer_episodes=1).size == 50 < plain.size

@@ -97,11 +97,6 @@ def close(**tolerance):
     return functools.partial(np.testing.assert_allclose, **tolerance)
 
 
-def test_every_agent_but_the_taught_one_is_tested():
-    # PPO+NOVELTY is a part of PPO+BC+NOVELTY.
-    assert {*ALGORITHMS, "gail", "ppo+novelty"} == set(gasil_jax.agents.AGENTS)
-
-
 @pytest.mark.parametrize("agent", each(SELF_TAUGHT))
 def test_it_learns_on_the_point_mass(agent):
     # What imitates alone, or as strongly, takes longer.

@@ -143,26 +143,3 @@ def test_samples_come_uniformly_from_the_filled_part():
     values, counts = np.unique(np.asarray(observation), return_counts=True)
     np.testing.assert_array_equal(values, [1, 3, 5])
     assert np.all(np.abs(counts - 1000) < 150)
-
-
-def test_a_history_keeps_next_observations_beside_the_observations_if_told_to():
-    zeros = jnp.zeros((2, 1))
-    steps = types.SimpleNamespace(
-        action=zeros[..., None], reward=zeros, ended=zeros > 0, faulty=0, cut_short=0
-    )
-
-    def record(history, observation):
-        steps.observation, steps.next_observation = observation, observation + 1
-        return rollout.record(history, steps)
-
-    history = rollout.init_history(
-        1, 2, 2, observation_size=1, action_size=1, keep_next=True
-    )
-    assert history.observation.shape == history.next_observation.shape == (1, 4, 1)
-    for first in (0.0, 2.0, 4.0):
-        observation = first + jnp.arange(2.0)[:, None, None]
-        history = record(history, observation)
-    assert history.in_time(history.observation).ravel().tolist() == [2, 3, 4, 5]
-    assert history.in_time(history.next_observation).ravel().tolist() == [3, 4, 5, 6]
-    history = rollout.init_history(1, 2, 2, observation_size=1, action_size=1)
-    assert record(history, observation).next_observation is None

@@ -4,7 +4,6 @@ That it learns from one: test_discrete.py.
 """
 
 import sys
-from contextlib import nullcontext
 
 import gymnasium
 import jax
@@ -47,22 +46,6 @@ def test_an_expert_is_data_of_which_each_device_has_one_copy(tmp_path):
     assert abs(sizes[10][1] - sizes[10_000][1]) < 1000
 
 
-def test_an_expert_counts_in_the_memory_that_a_run_needs(tmp_path, monkeypatch):
-    algorithm = write_expert(tmp_path / "expert.npz", 100_000)
-    env, devices = gasil_jax.make_env("point_mass"), jax.devices()[:2]
-    one = resources.need(env, algorithm)
-    assert one.shared > one.memory
-    # On each of two devices there is the expert, and all but one of two seeds.
-    for free, message in (
-        (2 * one.shared + one.memory, "the data of agent 'gail'"),
-        (2 * one.shared + 3 * one.memory, "seeds are 4 .*: at most 2 fit"),
-        (2 * one.shared + 4 * one.memory, None),
-    ):
-        monkeypatch.setattr(resources, "available", lambda _, free=free: free)
-        with pytest.raises(ValueError, match=message) if message else nullcontext():
-            resources.check_memory(one, algorithm, 4, devices)
-
-
 def test_an_expert_is_an_argument_of_a_training_function(tmp_path):
     env = gasil_jax.make_env("point_mass")
     algorithm = write_expert(tmp_path / "expert.npz", 9999).replace(total_steps=64)
@@ -70,14 +53,6 @@ def test_an_expert_is_an_argument_of_a_training_function(tmp_path):
     program = jax.make_jaxpr(train)(jax.random.key(0), None, data)
     assert [x.shape for x in program.in_avals[1:]] == [(9999, 11), (9999, 2)]
     assert all(np.size(x) < 9999 for x in program.consts)
-
-
-def test_an_expert_of_another_size_is_refused(tmp_path):
-    path = tmp_path / "other.npz"
-    np.savez(path, observation=np.zeros((9, 3)), action=np.zeros((9, 2)))
-    algorithm = gasil_jax.algorithm("gail", expert=str(path))
-    with pytest.raises(ValueError, match="of size 3 and actions of size 2"):
-        gasil_jax.make_train(gasil_jax.make_env("point_mass"), algorithm)
 
 
 @pytest.fixture
@@ -132,15 +107,6 @@ def test_a_minari_data_set_is_an_expert(data_set, tmp_path, monkeypatch):
         with pytest.raises(ValueError, match=message) as refusal:
             expert_module.load("minari:test/expert-v0")
         assert "\n" not in str(refusal.value)
-
-
-def test_a_demonstration_file_that_has_changed_is_read_again(tmp_path):
-    path = str(tmp_path / "expert.npz")
-    for length in (4, 7):
-        arrays = {name: np.ones((length, 2)) for name in ("observation", "action")}
-        np.savez(path, **arrays)
-        observation, action = expert_module.load(path)
-        assert len(observation) == len(action) == length
 
 
 def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):

@@ -1,8 +1,6 @@
 """The installed JAX computes correct numbers."""
 
 import contextlib
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
@@ -34,16 +32,6 @@ def test_many_batched_orthogonal_matrices_do_not_deadlock():
     for matrix in jax.jit(jax.vmap(six))(jnp.arange(8)):
         product = jnp.einsum("bij,bik->bjk", matrix, matrix)
         assert float(jnp.max(jnp.abs(product - jnp.eye(64)[None]))) < 1e-4
-
-
-def test_the_release_that_miscompiles_is_refused_at_import():
-    code = """
-import importlib.metadata
-importlib.metadata.version = lambda name: "0.10.2"
-import gasil_jax
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert "ImportError: jaxlib 0.10.2 gives wrong numbers" in done.stderr
 
 
 ALGORITHM = gasil_jax.algorithm(

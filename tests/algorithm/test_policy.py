@@ -96,24 +96,6 @@ def test_a_seed_or_an_observation_of_another_size_is_refused(saved, tmp_path):
                 act(observation)
 
 
-def test_a_batch_of_states_is_no_policy(saved):
-    env, _, states, _ = saved
-    states = states.replace(iteration=np.zeros(3, np.int32))
-    for none in (0, b"x", None, {"a": np.zeros(2), "b": 1.0}):
-        with pytest.raises(ValueError, match=r"states is .*: it must be arrays with"):
-            gasil_jax.member(none, 0)
-    with pytest.raises(ValueError, match="state is a batch of 3 states"):
-        policy.from_state(states, env)
-
-
-def test_a_policys_file_has_the_name_that_is_asked_for(saved, tmp_path):
-    env, _, states, _ = saved
-    path = tmp_path / "best.weights"
-    policy_file.save(path, states, env, [5, 6, 7], np.zeros(3))
-    assert list(tmp_path.iterdir()) == [path]
-    assert set(numpy_policy.read(path, 5)) >= {"mean", "log_std"}
-
-
 LAYERS = {
     "tanh": np.tanh,
     "relu": lambda x: np.maximum(x, 0.0),

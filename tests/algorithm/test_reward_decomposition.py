@@ -1,7 +1,5 @@
 """Decomposition of delayed rewards against plain loops, and its use in training."""
 
-import types
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,55 +109,6 @@ def decompose_all(batches, failed=()):
         yield state, history, np.asarray(reward), metrics
 
 
-@pytest.mark.parametrize(("num_episodes", "complete"), [(1, 1), (4, 4)])
-def test_a_longer_history_has_more_windows_of_a_whole_episode(num_episodes, complete):
-    """A window as long as an episode is complete only where all of it is kept."""
-    history = new_history(1, num_episodes=num_episodes)
-    most = 0
-    for batch in range(30):
-        step = batch * NUM_STEPS + np.arange(NUM_STEPS)[:, None]
-        ended = (step + 1) % LIMIT == 0
-        zeros = np.zeros((NUM_STEPS, 1, OBS), np.float32)
-        steps = types.SimpleNamespace(
-            observation=zeros,
-            action=zeros[..., :ACT],
-            reward=np.float32(ended),
-            ended=ended,
-            next_observation=zeros,
-            faulty=False,
-            cut_short=False,
-        )
-        history = rollout.record(history, steps)
-        windows = windows_of(history)
-        most = max(most, int(windows.ends.sum()))
-        assert (windows.length[windows.ends] == LIMIT).all()
-    assert most == complete
-
-
-def test_the_length_of_the_history_follows_the_agent_and_the_models():
-    env = gasil_jax.make_env("point_mass")
-    history = lambda *parts: (
-        jax.eval_shape(
-            lambda: gasil_jax.init(
-                env, gasil_jax.Algorithm(*parts, config=CONFIG), jax.random.key(0)
-            )
-        ).history
-    )
-    length = lambda *parts: history(*parts).reward.shape[1]
-    ppo, buffered = gasil_jax.PPO(), gasil_jax.PPOGASIL()
-    long = MODEL.replace(decomposition_history_episodes=3)
-    for episodes, *parts in (
-        (1, ppo, (MODEL,)),
-        (1, buffered),
-        (1, buffered, (MODEL,)),
-        (3, ppo, (long,)),
-        (3, buffered, (long,)),
-    ):
-        steps = episodes * env.episode_length + NUM_STEPS
-        assert length(*parts) == -(-steps // NUM_STEPS) * NUM_STEPS
-    assert history(ppo, (gasil_jax.Normalize(),)) is None
-
-
 def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_paid():
     """Also one that began in an earlier batch, for a replay of whole episodes."""
     batches, steps, begin_before = list(random_batches(0, 9)), [], 0
@@ -192,28 +141,6 @@ def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_pai
             total = given[env, begin : end + 1].sum()
             np.testing.assert_allclose(total, payout, rtol=1e-4, atol=1e-5)
     assert begin_before > 5
-
-
-def test_a_window_is_given_what_it_paid():
-    """A window within a batch; one that began before lacks its share of that."""
-    batches = list(random_batches(1, 6))
-    assert sum(batch.faulty.sum() for batch in batches) > 0
-    begins_here = np.ones(NUM_ENVS, bool)
-    for batch, (_, _, reward, _) in zip(batches, decompose_all(batches), strict=True):
-        for env in range(NUM_ENVS):
-            running = []
-            for t in range(NUM_STEPS):
-                running.append(reward[t, env])
-                paid = batch.reward[t, env]
-                if paid == 0 and not batch.ended[t, env]:
-                    continue
-                if begins_here[env] and not batch.faulty[t, env]:
-                    np.testing.assert_allclose(sum(running), paid, rtol=1e-4, atol=1e-5)
-                    if len(running) == 1:
-                        assert reward[t, env] == paid
-                begins_here[env], running = True, []
-            begins_here[env] = not running
-        np.testing.assert_array_equal(reward[batch.faulty], 0.0)
 
 
 def test_a_failed_update_leaves_the_network_and_nothing_else():
@@ -345,11 +272,3 @@ def test_a_minibatch_in_parts_has_the_gradient_of_the_whole():
     )
     for parts in (2, 3, 12):
         np.testing.assert_allclose(of(parts), of(1), rtol=1e-5)
-
-
-def test_large_inputs_are_read_in_as_few_parts_as_fit():
-    num_parts = decomposition.num_parts
-    assert num_parts(64, 32 * 40) == 1
-    assert num_parts(64, 32 * 713) == 4
-    assert num_parts(7, 2**18) == 7
-    assert num_parts(6, 2**30) == 6

@@ -73,13 +73,6 @@ def test_ages_are_uniform_over_the_episode_and_of_the_seeds_own_key():
     assert (ages[0] != ages[1]).any()
 
 
-def test_ages_leave_the_starts_as_they_are():
-    env, key = gasil_jax.make_env("point_mass", obs_noise=0.1), jax.random.key(0)
-    plain, staggered = (rollout.init(env, key, 5, age_limit=x) for x in (None, 50))
-    np.testing.assert_array_equal(plain.state.obs, staggered.state.obs)
-    assert not plain.starting_age.any() and staggered.starting_age.any()
-
-
 def test_a_first_episode_is_cut_at_the_limit_and_bootstrapped():
     ages, batch = collect(make(), num_envs=16, num_steps=3 * LIMIT)
     for env, age in enumerate(ages):
@@ -179,17 +172,3 @@ def test_a_delayed_reward_is_paid_once_where_the_episode_is_cut(delay):
         given = reward[: first + 1, env]
         assert given.sum() == -(first + 1)
         assert np.count_nonzero(given) == -(-(first + 1) // delay)
-
-
-def test_each_batch_holds_nearly_all_parts_of_an_episode():
-    limit, num_envs, num_steps = 1000, 32, 64
-    env = make(limit)
-    for stagger, low, high in ((True, 0.9, 1.0), (False, 0.0, 0.1)):
-        ages, batch = collect(env, num_envs, 30 * num_steps, limit, stagger)
-        # The environment's own clock does not know at which age it began.
-        length = np.asarray(batch.episode_length)
-        first = np.cumsum(np.asarray(batch.ended), axis=0) - batch.ended == 0
-        age = length - 1 + np.where(first, ages, 0)
-        for part in np.split(age, 30):
-            share = len(np.unique(part // 25)) / (limit // 25)
-            assert low <= share <= high

@@ -1,19 +1,17 @@
 """Saving, loading and scoring a run's policies."""
 
-import csv
 import shutil
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs import Wrapper
 from refusals import refused
-from small_training import drawn_policies
+from small_training import drawn_policies, table
 
 import gasil_jax
 from gasil_jax import evaluate, evaluation, numpy_policy, policy
-from gasil_jax.host import checkpoint, saved
+from gasil_jax.host import checkpoint
 
 # With the other tests that use it, so that it is trained once.
 on_trained = pytest.mark.xdist_group("commands")
@@ -30,8 +28,7 @@ def test_one_seed_scores_as_with_all_and_every_episode_is_written(
     assert header.split()[0] == "seed" and where == f"in {out}"
     assert over_seeds.startswith("return ")
     assert over_seeds.endswith("(interquartile mean over 3 seeds)")
-    with out.open() as file:
-        rows = list(csv.DictReader(file))
+    rows = table(out)
     assert [(row["seed"], row["episode"]) for row in rows] == [
         (seed, episode) for seed in "567" for episode in "012"
     ]
@@ -58,15 +55,6 @@ def test_the_best_checkpoint_is_scored_or_refused(trained, tmp_path, capsys):
     capsys.readouterr()
     told = refused(capsys, evaluate, out, "--checkpoint", "best")
     assert f"{best} is damaged: state/_METADATA is not what was written" in told
-
-
-@on_trained
-def test_the_saved_policies_are_those_of_the_last_checkpoint(trained):
-    env, _, seeds, states = saved.load(trained.folder, seed=6)
-    assert seeds == [6]
-    expected = policy.weights(states, env)
-    for name, weight in numpy_policy.read(trained.folder, 6).items():
-        np.testing.assert_allclose(weight, np.squeeze(expected[name]), rtol=1e-6)
 
 
 def test_gymnasiums_episodes_have_the_runs_limit():
@@ -111,24 +99,3 @@ def test_scores_are_those_of_a_plain_loop(untrained):
         assert int(scored["episode_length"][i]) == length == 50
     drawn = scores(*untrained, deterministic=False)
     assert not np.allclose(drawn["episode_return"], scored["episode_return"])
-
-
-def test_an_episode_that_is_only_cut_off_ends_too(untrained):
-    """As in training; `done` need not be set beside `truncation`."""
-    env, algorithm, state = untrained
-
-    class CutOff(Wrapper):
-        def reset(self, rng):
-            state = self.env.reset(rng)
-            info = {"time": jnp.int32(0), "truncation": jnp.float32(0)}
-            return state.replace(info={**state.info, **info})
-
-        def step(self, state, action):
-            time = state.info["time"] + 1
-            stepped = self.env.step(state, action)
-            cut_off = jnp.where(time == 7, 1.0, 0.0)
-            info = {**stepped.info, "time": time, "truncation": cut_off}
-            return stepped.replace(info=info, done=jnp.zeros_like(stepped.done))
-
-    lengths = scores(CutOff(env), algorithm, state)["episode_length"]
-    assert lengths.tolist() == [7, 7, 7]

@@ -5,8 +5,6 @@ import importlib
 import json
 import re
 
-import jax
-import numpy as np
 import pytest
 from refusals import refused, rows
 from small_training import DISCRIMINATOR_FLAGS, FLAGS
@@ -53,14 +51,6 @@ class Counts(Own):
         return {"count": jnp.int32(0)}
 
 
-class Plain:
-    pass
-
-
-def helper(state):
-    return state
-
-
 INSTANCE = Own()
 """
 #: What stands for parts of the definitions below.
@@ -84,8 +74,6 @@ WRONG = rows(
     r"""
 Own | name = "mine" | calls itself 'mine': name the module
 Agent | gamma: ONE | 'gamma', a name that is taken
-Agent | reward_clip: ONE | 'reward_clip', a name that is taken
-Agent | diverged: ONE | 'diverged', a name that is taken
 Agent | seeds: ONE | 'seeds', a name that is taken by an option
 Agent | bare: float = 0.5 | 'bare' has no range: .*config.number
 Agent | my_weight: float = number(2.0, 0.0, 1.0) | my_weight is 2.0: it must be 0 or m
@@ -93,20 +81,13 @@ Own | def __post_init__(self): raise RuntimeError('not') | RuntimeError: not \(.
 Own | REWARD state, PAID, {'my': PAID} | 'my' .* has shape .*: it must be one number
 Own | REWARD (state, {}) | reward .* returns 2 values: .* 3, state, rewards, metrics
 Own | POLICY state, actor_critic, {}, {} | update_policy .* returns 4 values: .* 3, sta
-Own | MIX advantages[..., 0] | mix of agent .* returns 1 value: .* 2, advantage, metrics
 Own | REWARD state, PAID.sum(axis=0), {} | rewards is float32\[4\]: .*32\[32, 4\]
-Own | MIX (advantages, {}) | mix .* advantage is float32\[32, 4, 1\]: .*32, 4\]
 Own | num_streams = 2 | has 2 reward streams: it must have a function mix that
 Own | MIX (advantages[..., 0], {'value_loss': 0.5}) | 'value_loss' .* of another metric
-Own | REWARD state, context.nothing, {} | traced: AttributeError: .*my_agents.py, li
 Counts | REWARD {'count': jnp.zeros(3, int)}, PAID, {} | 'count'\] is int32\[3\]: .*int
-Counts | REWARD {'count': state['count'] + 0.5}, PAID, {} | is float32\[\]: .* int32\[\]
 Counts | def remember(self, state, context): pass | state\['count'\] is missing: .*int
-Own | POLICY state, (), {} | update_policy of .* actor_critic.* missing:
-Own | POLICY state, actor_critic, None | update_policy .* returns metrics None: .* a d
 Own | REWARD sys.exit() | can't be traced: SystemExit \(.*my_agents
 Own | def check(self, sizes): sys.exit(7) | check of agent .* fails: SystemExit: 7
-Own | def check(self, sizes): return sizes.alhpa | .* fails: AttributeError: .*alhpa
 """
 )
 for number, (base, definition, _) in enumerate(WRONG):
@@ -115,8 +96,6 @@ for number, (base, definition, _) in enumerate(WRONG):
 NAMES = """
 nowhere:Own | 'nowhere:Own' can't be imported: No module named 'nowhere'
 my_agents:No | can't be imported: module 'my_agents' has no attribute 'No'
-my_agents:helper | is of type function: it must be a class that is derived
-my_agents:Plain | is of type type: it must be a class that is derived from
 my_agents:INSTANCE | is of type Own: it must be a class that is derived
 leaves:Own | 'leaves:Own' can't be imported: SystemExit: 3
 my_agents | 'my_agents' is unknown: it must be .*, gail, MODULE:CLASS$
@@ -197,10 +176,6 @@ def test_what_is_no_agent_is_refused_in_a_line(tmp_path, capsys, agent, why):
 #: Words of `run`, or of `sweep` with a grid.
 NUMBERS = """
 --my-weight 2 | my_weight is 2.0: it must be 0 or more and at most 1
---my-weight much | my_weight is 'much': it must be a number
---my-wieght 0.2 | --my-weight
---agent ppo --my-weight 0.2 | option --my-weight is unknown
---alpha 0.2 | alpha is a setting of gasil, ppo+gasil, gail
 --grid my_weight=0.1,2 | my_weight is 2.0: it must be 0 or more
 --grid my_wieght=0.1 | did you mean 'my_weight'?
 --agent ppo --grid my_weight=0.1 | 'my_weight' can't vary
@@ -232,29 +207,13 @@ def test_an_algorithm_has_the_numbers_of_its_agent(my_agents):
     assert algorithm.agent.my_weight == algorithm.hyperparameters["my_weight"] == 0.5
     changed = algorithm.replace(my_weight=0.1, gamma=0.9)
     assert changed.agent.my_weight == 0.1 and changed.config.gamma == 0.9
-    assert {algorithm, changed, algorithm.replace(my_weight=0.1, gamma=0.9)} == {
-        algorithm,
-        changed,
-    }
-    algorithms.check(changed)
+    assert {changed, algorithm.replace(my_weight=0.1, gamma=0.9)} == {changed}
     assert gasil_jax.preset("hopper", my_agents.Own).agent.my_weight == 0.5
     # With another agent it has the others.
     other = dataclasses.replace(changed, agent=gasil_jax.PPO())
     assert "my_weight" not in other.settings and other.settings["gamma"] == 0.9
-    with pytest.raises(ValueError, match=r"'my_wieght'.*did you mean 'my_weight'"):
-        algorithm.replace(my_wieght=0.1)
     with pytest.raises(ValueError, match="my_weight is -1"):
         algorithms.check(algorithm.replace(my_weight=-1))
-
-
-def test_numbers_that_are_not_given_have_their_defaults(my_agents):
-    config = gasil_jax.Config(batch_steps=64, num_envs=4, hidden_sizes=(4,))
-    algorithm = gasil_jax.Algorithm(my_agents.Own(), config=config)
-    env, given = gasil_jax.make_env("point_mass"), {"gamma": 0.9}
-    init = jax.jit(lambda key: gasil_jax.init(env, algorithm, key, given))
-    state = init(jax.random.key(0))
-    np.testing.assert_allclose(state.hyperparameters["my_weight"], 0.5)
-    np.testing.assert_allclose(state.hyperparameters["gamma"], 0.9)
 
 
 MODEL = """
@@ -275,12 +234,8 @@ WRONG_MODELS = rows(
     r"""
 UPDATE state, context, {} | update .* 3 values: .*state, context, learned
 UPDATE state, context.rollout, True, {} | returned context.rollout.* missing
-UPDATE (), context, PAID > 0, {} | learned is bool.32, 4.:
-UPDATE state, context, 'yes', {} | update .* returns what is no array:
 UPDATE state, context, True, {'entropy': 0} | 'entropy' of a model of rew
 def update(self, state, context): pass | traced: .*update\(\) takes 3 posi
-def init(self, key): pass | can't be traced: .*init\(\) takes 2 positional
-gamma: ONE | 'gamma', a name that is taken:
 seeds: ONE | 'seeds', a name that is taken by an option
 """
 )
@@ -304,11 +259,10 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     both = stored.replace(decompose_rewards=True)
     kinds = (my_models.Signs, gasil_jax.Decompose, gasil_jax.Normalize)
     assert tuple(map(type, both.rewards)) == kinds
-    again = ["--resume", "--out", "out"]
-    assert run.main([*again, "--total-steps", "384"]) == 0
     assert evaluate.main(["out", "--episodes", "1"]) == 0
     assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
-    told = refused(capsys, run, *again, "--rewards", "my_models:Wrong0")
+    again = ["--resume", "--out", "out", "--rewards", "my_models:Wrong0"]
+    told = refused(capsys, run, *again)
     assert "rewards was ['my_models:Signs'], is ['my_mod" in told
 
 

@@ -5,7 +5,6 @@ import shutil
 
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from refusals import refused
 
 from gasil_jax.cli import plot
@@ -16,19 +15,6 @@ pytestmark = pytest.mark.xdist_group("commands")
 
 def texts(legend):
     return [text.get_text().strip() for text in legend.get_texts()]
-
-
-@pytest.fixture
-def figures(monkeypatch):
-    """The figures that are saved in a test; their files are empty."""
-    kept = []
-
-    def keep(figure, path, **_):
-        kept.append(figure)
-        path.touch()
-
-    monkeypatch.setattr(Figure, "savefig", keep)
-    return kept
 
 
 def test_runs_and_points_of_sweeps_are_drawn(trained, swept, tmp_path, capsys):

@@ -1,7 +1,6 @@
 """Films of a run's policy."""
 
 import itertools
-import os
 import subprocess
 import sys
 
@@ -109,27 +108,3 @@ def test_an_episode_ends_before_the_physics_fails(trained):
     run = video.make_episode(Failing(), num_steps=20)
     states, total = run(policies.weights[0], jax.random.key(0))
     assert len(states) == 4 and total == 3.0
-
-
-def test_without_a_display_and_egl_nothing_is_drawn_by_opengl():
-    # It is decided before MuJoCo is imported, which reads it once.
-    code = """
-import ctypes.util, os, sys
-ctypes.util.find_library = lambda name: None
-sys.modules["mujoco"] = None
-try:
-    import gasil_jax.render
-except ImportError:
-    print(os.environ["MUJOCO_GL"])
-"""
-    unset = {k: x for k, x in os.environ.items() if k not in ("MUJOCO_GL", "DISPLAY")}
-    command = [sys.executable, "-c", code]
-    done = subprocess.run(command, env=unset, capture_output=True, text=True)
-    assert done.stdout.split() == ["disable"], done.stderr
-
-
-def test_a_missing_package_is_named(trained, tmp_path, monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
-    path = tmp_path / "film.mp4"
-    assert render.main([str(trained.folder), "--out", str(path)]) == 2
-    assert "needs the package imageio-ffmpeg" in capsys.readouterr().err

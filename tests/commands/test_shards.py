@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from matplotlib.figure import Figure
 from refusals import refused
 
 import gasil_jax
@@ -74,6 +73,9 @@ def test_points_that_differ_in_traced_numbers_alone_share_a_program(tmp_path):
     ]
 
 
+# Pictures are drawn, and not written, which takes most of the time here.
+pytestmark = pytest.mark.usefixtures("figures")
+
 GRID = ("alpha=0.1,1", "discriminator_updates=1,2")
 SMALL = (
     *("--env", "point_mass", "--total-steps", "300", "--batch-steps", "100"),
@@ -133,12 +135,6 @@ def write_metrics(program):
 
 
 TABLES = ("results.csv", "curves.npz")
-
-
-@pytest.fixture(autouse=True)
-def no_pictures(monkeypatch):
-    """Pictures are drawn, and not written, which takes most of the time here."""
-    monkeypatch.setattr(Figure, "savefig", lambda _, path, **__: path.touch())
 
 
 def continued(folder, *arguments):

@@ -1,6 +1,5 @@
 """Sweeps run, grow or are refused; a point's results are those of a single run."""
 
-import csv
 import json
 import os
 import pathlib
@@ -11,10 +10,10 @@ import jax
 import numpy as np
 import pytest
 from refusals import refused, rows
-from small_training import FLAGS
+from small_training import FLAGS, table
 
 import gasil_jax
-from gasil_jax import evaluate, plot, run, sweep
+from gasil_jax import plot, run, sweep
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
@@ -73,10 +72,7 @@ def test_points_from_a_file(tmp_path):
         },
     ]
     for text, message in (
-        ("[", "can't be read"),
         ("[" * 100_000, "can't be read"),
-        (f'[{{"alpha": 1{"0" * 400}}}]', "it must be 0 or more and finite"),
-        ("{}", "a list of points"),
         ("[3]", "each point must be an object"),
         ('[{"alhpa": 1}]', "did you mean 'alpha'"),
         ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
@@ -86,27 +82,21 @@ def test_points_from_a_file(tmp_path):
             points_of("--points-file", str(path))
 
 
-def table(folder):
-    with (folder / "results.csv").open() as file:
-        return list(csv.DictReader(file))
-
-
 def test_a_sweep_from_end_to_end(swept):
     out, told, printed = swept
     assert "x 8 runs" in told
-    best, worst, speed, following = printed.splitlines()
+    best, speed, following = printed.splitlines()
     value = r"-?\d+\.\d"
     sentence = (
         rf"point (0|1), learning_rate=0.0003, discriminator_updates=(3|1): "
-        rf"mean {value}, interquartile mean {value}, worst seed {value}$"
+        rf"mean {value}, interquartile mean {value}$"
     )
     assert re.match(f"best mean: {sentence}", best), best
-    assert re.match(f"best worst seed: {sentence}", worst), worst
     assert re.match(r"[\d,]+ steps/s on .*, in out$", speed), speed
     commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out; "
     assert following.startswith(f"next: {commands}python -m gasil_jax.render out ")
 
-    rows = table(out)
+    rows = table(out / "results.csv")
     assert [(row["point"], row["seed"]) for row in rows] == [
         (str(point), seed) for point in range(4) for seed in "56"
     ]
@@ -147,16 +137,6 @@ def test_points_equal_single_runs(trained, swept):
         states.actor_critic.params,
         expected.actor_critic.params,
     )
-
-
-def test_the_commands_take_a_point_or_the_best_one_and_say_so(swept, capsys):
-    folder = str(swept.folder)
-    best = json.loads((swept.folder / "summary.json").read_text())["best_by_mean"]
-    assert evaluate.main([folder, "--episodes", "1"]) == 0
-    told = capsys.readouterr()
-    assert f"point {best}, the best by mean (learning_rate=0.0003" in told.err
-    assert evaluate.main([folder, "--episodes", "1", "--point", str(best)]) == 0
-    assert capsys.readouterr().out == told.out
 
 
 @pytest.fixture
@@ -218,10 +198,8 @@ def test_other_settings_and_a_folder_of_something_else_are_refused(
     grid = [*FLAGS, "--grid", "alpha=1"]
     for words, message in (
         ([*again, "--gamma", "0.9"], "gamma was 0.98, is 0.9"),
-        ([*again, "--reward-delay", "3"], "reward_delay was 1, is 3"),
         ([*grid, "--out", str(tmp_path / "s")], "is not empty"),
         ([*grid, "--out", str(tmp_path / "thesis")], "is not empty"),
-        ([*again, "--points-file", "no.json"], "no.json, which can't be read"),
     ):
         assert message in refused(capsys, sweep, *words)
     assert not planned
@@ -272,7 +250,7 @@ def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
     agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
     own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")
     assert run.main([*FLAGS, *agents, *own, "--out", "out"]) == 0
-    rows = list(csv.DictReader(pathlib.Path("out/results.csv").open()))
+    rows = table("out/results.csv")
     assert [row["agent"] for row in rows] == ["ppo", "ppo+sil"]
     stored = read_sweep(pathlib.Path("out"))
     # Each has its own preset, and of what is given what it has.

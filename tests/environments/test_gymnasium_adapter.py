@@ -5,13 +5,12 @@ import multiprocessing
 import gymnasium
 import jax
 import jax.numpy as jnp
-import minari
 import numpy as np
 import pytest
 from brax.envs import Env, State
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from gymnasium.wrappers import MaxAndSkipObservation, TimeLimit
+from gymnasium.wrappers import TimeLimit
 
 import gasil_envs
 from gasil_envs import gymnasium_adapter
@@ -123,45 +122,6 @@ def test_no_reward_is_lost_where_a_limit_cuts_the_episode(make):
     assert np.all(earned != 0.0)
 
 
-def test_a_limit_counts_the_steps_of_the_wrapper_that_it_is_around():
-    env = gymnasium_adapter.GymnasiumEnv("point_mass", reward_delay=20)
-    env = TimeLimit(MaxAndSkipObservation(env, skip=3), 5)
-    inner, given, earned = env.unwrapped.step, 0.0, []
-
-    def step(action):
-        *others, info = inner(action)
-        earned.append(info["true_reward"])
-        return *others, info
-
-    env.unwrapped.step = step
-    env.reset(seed=0)
-    for count in range(1, 6):
-        _, reward, terminated, truncated, _ = env.step(np.ones(2, np.float32))
-        given += reward
-        assert not terminated and truncated == (count == 5)
-    assert len(earned) == 15
-    assert given == pytest.approx(sum(earned), rel=1e-4) and given != 0.0
-
-
-def test_a_batch_is_not_drawn():
-    with pytest.raises(ValueError, match="render_mode is 'rgb_array': it must be None"):
-        gymnasium.make_vec("gasil_envs/point_mass", 2, render_mode="rgb_array")
-
-
-def test_observations_may_be_changed():
-    env = gymnasium.make("gasil_envs/point_mass")
-    observation, _ = env.reset(seed=0)
-    observation -= 1.0
-    observation, *_ = env.step(np.ones(2, np.float32))
-    observation -= 1.0
-
-
-def test_a_limit_above_the_environments_own_is_refused():
-    for wrong in (51, 0, "5"):
-        with pytest.raises(ValueError, match="whole number from 1 to 50"):
-            gasil_envs.make("point_mass", max_episode_steps=wrong)
-
-
 def test_a_limit_around_it_above_its_own_is_refused():
     env = gymnasium.make("gasil_envs/point_mass", max_episode_steps=51)
     with pytest.raises(ValueError, match=r"max_episode_steps is 51: .* limit is 50"):
@@ -203,17 +163,6 @@ def test_a_forked_process_is_refused(make):
     child.join(60)
 
 
-def test_forked_processes_of_gymnasium_are_refused_in_the_parent():
-    forked = {"context": "fork"}
-    with pytest.raises(RuntimeError, match=r'kwargs=\{"context": "spawn"\}'):
-        gymnasium.make_vec(
-            "gasil_envs/point_mass",
-            num_envs=2,
-            vectorization_mode="async",
-            vector_kwargs=forked,
-        )
-
-
 @SINGLE_AND_BATCH
 def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
     env = make()
@@ -222,19 +171,6 @@ def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
     describe = lambda info: {key: (type(x), np.shape(x)) for key, x in info.items()}
     assert describe(first) == describe(then)
     assert not np.any(first["true_reward"])
-
-
-@pytest.mark.filterwarnings("ignore::UserWarning")  # on who made the data set
-def test_minari_collects_episodes_with_their_infos(tmp_path, monkeypatch):
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    env = gymnasium.make("gasil_envs/point_mass", reward_delay=5)
-    collector = minari.DataCollector(env, record_infos=True)
-    collector.reset(seed=0)
-    for _ in range(50):
-        collector.step(env.action_space.sample())
-    data = collector.create_dataset("test/point-v0")
-    (episode,) = data.iterate_episodes()
-    assert episode.infos["true_reward"].shape == (51,)
 
 
 @SINGLE_AND_BATCH

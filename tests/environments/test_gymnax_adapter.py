@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from brax.envs import Env, State
 
 import gasil_envs
 from gasil_envs.gymnax_adapter import GymnaxEnv
@@ -47,39 +46,6 @@ def test_episodes_are_those_of_our_environment():
         assert not terminated and bool(truncated) == (i % 50 == 49)
         state = reset(key) if truncated else stepped
         np.testing.assert_allclose(observation, state.obs, atol=1e-5)
-
-
-class Countdown(Env):
-    """Ends by itself after three steps; observes how many are left."""
-
-    observation_size = action_size = 1
-    backend = "none"
-
-    def reset(self, rng):
-        return State(None, jnp.full(1, 3.0), jnp.float32(0), jnp.float32(0))
-
-    def step(self, state, action):
-        left = state.obs - 1.0
-        return state.replace(obs=left, done=jnp.float32(left[0] == 0), reward=left[0])
-
-
-def test_an_end_is_not_a_cut():
-    env = GymnaxEnv("point_mass")
-    env._env = Countdown()
-    observation, state = env.reset(jax.random.key(0))
-    seen = []
-    for _ in range(4):
-        observation, state, reward, *ended, info = env.step(
-            jax.random.key(1), state, jnp.zeros(1)
-        )
-        last = info["final_observation"]
-        seen.append((*map(float, (observation[0], last[0], reward)), *map(bool, ended)))
-    assert seen == [
-        (2.0, 2.0, 2.0, False, False),
-        (1.0, 1.0, 1.0, False, False),
-        (3.0, 0.0, 0.0, True, False),
-        (2.0, 2.0, 2.0, False, False),
-    ]
 
 
 def test_gymnax_own_wrappers_take_it():

@@ -31,15 +31,17 @@ def test_reset_and_step(name):
     assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()
 
 
-@pytest.mark.parametrize("name", ["hopper", "halfcheetah_noisy"])
+@pytest.mark.parametrize("name", ["hopper", "halfcheetah"])
 def test_a_robot_is_paid_for_each_healthy_step_beyond_its_distance_alone(name):
-    env = gasil_envs.make(f"sparse:{name}")
-    user_environment.check(name, env.env, env)
+    # With MuJoCo's physics, of which nothing takes long to compile.
+    task = gasil_envs.make(f"sparse:{name}").unwrapped.task
+    env = locomotion.Locomotion(task, physics="mujoco")
+    user_environment.check(name, env, env)
     reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
     check_reset_and_step(env, reset, step)
     start = reset(jax.random.split(jax.random.key(0), BATCH))
     physics = start.pipeline_state.physics
-    metres = mazes.ROBOTS[name.removesuffix("_noisy")]
+    metres = mazes.ROBOTS[name]
     moved = metres + jnp.linspace(-0.1, 0.1, BATCH)
     # Every other robot lies on its head, which ends a hopper's episode.
     qpos = physics.qpos.at[:, 0].set(moved).at[::2, 2].set(2.0)
@@ -125,37 +127,6 @@ def test_a_maze_can_be_solved_in_its_time(name):
     assert state.info["steps"] < 0.8 * layout.episode_length
 
 
-def walked(env, way):
-    """Return the number of steps from the start's middle to the goal, or None."""
-    state = env.reset(jax.random.key(0))
-    start = state.pipeline_state.replace(position=jnp.asarray(env.unwrapped._start))
-    state, step = state.replace(pipeline_state=start), jax.jit(env.step)
-    for count in range(1, env.unwrapped.episode_length):
-        state = step(state, jnp.array(way(*np.asarray(state.pipeline_state.position))))
-        if state.done:
-            return count
-    return None
-
-
-def test_both_ways_to_the_goal_are_as_long_and_their_mean_leads_into_the_wall():
-    env = gasil_envs.make("sparse:two_doors")
-    rows = env.unwrapped.layout.rows
-    assert all(row == row[::-1] for row in rows)
-
-    def way(side):
-        def action(row, column):
-            if row > 5.2:  # Before the wall, beside it, and behind it.
-                return 5.2 - row, 4.5 + 2.1 * side - column
-            return (-1.0, 0.0) if row > 2.5 else (1.5 - row, 4.5 - column)
-
-        return action
-
-    left, right = way(-1.0), way(1.0)
-    mean = lambda *at: np.mean([left(*at), right(*at)], axis=0)
-    counts = [walked(env, x) for x in (left, right, mean)]
-    assert counts[0] == counts[1] < 12 and counts[2] is None
-
-
 def test_a_door_opens_with_the_key_alone_and_an_object_pays_once():
     env = mazes.Maze(mazes.Layout(("#####", "#SKD#", "#A.T#", "#####"), 9, None, 10.0))
     moves = {"up": 0, "down": 1, "left": 2, "right": 3}
@@ -205,57 +176,22 @@ def test_a_car_that_pushes_with_its_velocity_leaves():
 
 
 def test_noise_changes_actions_and_is_decided_by_the_key_of_the_reset():
-    env = wrappers.ActionNoise(mazes.build("u_maze"), 0.5)
-    step = jax.jit(lambda key: env.step(env.reset(key), jnp.zeros(2)))
-    moved = jax.vmap(step)(jax.random.split(jax.random.key(0), 500))
-    moves = (
-        moved.pipeline_state.position
-        - jax.vmap(env.reset)(
-            jax.random.split(jax.random.key(0), 500)
-        ).pipeline_state.position
-    )
+    def moves(name, noise, action):
+        """From 1000 starts, how far a step with noise goes."""
+        env = wrappers.ActionNoise(mazes.build(name), noise)
+
+        def move(key):
+            state = env.reset(key)
+            after = env.step(state, action)
+            return after.pipeline_state.position - state.pipeline_state.position
+
+        keys = jax.random.split(jax.random.key(0), 1000)
+        return np.array(jax.jit(jax.vmap(move))(keys))
+
     # Its velocity is the speed times noise of half a deviation.
-    assert np.std(moves) == pytest.approx(0.15, rel=0.1)
-    np.testing.assert_array_equal(
-        step(jax.random.key(3)).obs, step(jax.random.key(3)).obs
-    )
-    grid = wrappers.ActionNoise(mazes.build("key_grid"), 0.4)
-    after = jax.vmap(lambda key: grid.step(grid.reset(key), jnp.int32(1)))(
-        jax.random.split(jax.random.key(1), 1000)
-    )
-    other = jax.vmap(grid.reset)(jax.random.split(jax.random.key(1), 1000))
-    down = after.pipeline_state.position[:, 0] - other.pipeline_state.position[:, 0]
-    assert np.mean(down == 1) == pytest.approx(0.7, abs=0.05)
-
-
-@pytest.mark.parametrize(("name", "noise"), [("u_maze", 0.5), ("key_grid", 0.1)])
-def test_a_noisy_task_is_the_task_with_noise_on_its_actions(name, noise):
-    envs = [
-        gasil_envs.make(f"sparse:{name}", action_noise=noise),
-        gasil_envs.make(f"sparse:{name}_noisy"),
-        gasil_envs.make(f"sparse:{name}"),
-    ]
-
-    def walk(env):
-        zero = wrappers.zero_action(env)
-        start = env.reset(jax.random.key(0))
-        step = lambda state, _: (env.step(state, zero), state.pipeline_state.position)
-        return jax.jit(lambda x: jax.lax.scan(step, x, length=40)[1])(start)
-
-    given, noisy, calm = map(walk, envs)
-    np.testing.assert_array_equal(given, noisy)
-    assert (np.array(given) != calm).any()
-
-
-@pytest.mark.parametrize(
-    ("name", "noise", "allowed"),
-    [
-        ("sparse:u_maze_noisy", 0.1, "0: sparse:u_maze_noisy has its own"),
-        ("sparse:key_grid", 1.5, "at most 1, a share, for sparse:key_grid"),
-        ("hopper", -1.0, "finite and 0 or more"),
-        ("hopper", "loud", "finite and 0 or more"),
-    ],
-)
-def test_noise_that_can_not_be_is_refused(name, noise, allowed):
-    with pytest.raises(ValueError, match=f"^action_noise is .*: it must be {allowed}$"):
-        gasil_envs.make(name, action_noise=noise)
+    moved = moves("u_maze", 0.5, jnp.zeros(2))
+    assert np.std(moved) == pytest.approx(0.15, rel=0.1)
+    np.testing.assert_array_equal(moved, moves("u_maze", 0.5, jnp.zeros(2)))
+    # A random one of four moves, the one that was asked for among them.
+    down = moves("key_grid", 0.4, jnp.int32(1))[:, 0] == 1
+    assert np.mean(down) == pytest.approx(0.7, abs=0.05)

@@ -8,7 +8,6 @@ from brax.envs import Env, State
 
 import gasil_envs
 from gasil_envs import wrappers
-from gasil_jax.evaluation import run_episodes
 
 
 class Scripted(Env):
@@ -71,31 +70,6 @@ def test_the_phase_of_a_delay_is_seen():
     np.testing.assert_array_equal(seen.obs[:, -1], [0.25, 0.5, 0.75, 0.0, 0.25, 0.5])
     np.testing.assert_array_equal(seen.obs[:, :-1], plain.obs)
     np.testing.assert_array_equal(seen.reward, plain.reward)
-    with pytest.raises(ValueError, match="observe_phase is True: it needs a reward_de"):
-        gasil_envs.make("point_mass", observe_phase=True)
-    with pytest.raises(ValueError, match="observe_phase is 1: it must be True or Fal"):
-        gasil_envs.make("point_mass", reward_delay=4, observe_phase=1)
-
-
-class DoneFromTheStart(Scripted):
-    """Says that it has ended in its reset, and leaves that as it is."""
-
-    def reset(self, rng):
-        return super().reset(rng).replace(done=jnp.float32(1))
-
-    def step(self, state, action):
-        return super().step(state, action).replace(done=state.done)
-
-
-@pytest.mark.parametrize("limited", [False, True])
-def test_no_episode_ends_with_its_reset(limited):
-    env = DoneFromTheStart(100)
-    if limited:
-        env = wrappers.EpisodeLimit(env, 100)
-        assert not roll(env, 7)[1].done.any()
-    act = lambda observation, key: jnp.zeros((len(observation), 1))
-    scores = run_episodes(env, act, jax.random.key(0), num_episodes=2, num_steps=7)
-    np.testing.assert_array_equal(scores["episode_length"], [7, 7])
 
 
 class WithTrueReward(Scripted):
@@ -137,11 +111,6 @@ class Truncating(Scripted):
         state = super().step(state, action)
         info = {**state.info, "truncation": state.done.astype(jnp.int32)}
         return state.replace(info=info)
-
-
-def test_an_environments_own_truncation_stays():
-    _, cut = roll(wrappers.EpisodeLimit(Truncating(4), 7), 4)
-    np.testing.assert_array_equal(cut.info["truncation"], [0, 0, 0, 1])
 
 
 class OnlyTruncating(Truncating):
@@ -271,5 +240,3 @@ def test_a_terminal_limit_is_no_truncation():
         for _ in range(2):
             state = env.step(state, jnp.zeros(env.action_size))
         assert state.done == 1.0 and state.info["truncation"] == (not terminal)
-    with pytest.raises(ValueError, match="terminal_limits is 1: it must be True or F"):
-        gasil_envs.make("point_mass", terminal_limits=1)

@@ -97,13 +97,3 @@ def test_the_policy_is_followed_and_left_alone_while_nothing_is_kept():
     policy, metrics = cloned(CLONING.agent, empty)
     assert np.isnan(metrics["return_gap"])
     assert distance(policy, networks().policy) == 0.0
-
-
-def test_equal_episodes_are_not_cloned():
-    """Before the first reward PPO+BC holds the policy at its untrained self."""
-    _, state = context_and_state()
-    buffer = state.buffer.replace(return_=0.0 * state.buffer.return_)
-    tied = state.replace(buffer=buffer, policy_return=jnp.float32(0.0))
-    policy, metrics = cloned(CLONING.agent, tied)
-    assert metrics["return_gap"] == 0.0
-    assert distance(policy, networks().policy) == 0.0

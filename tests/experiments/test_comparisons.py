@@ -9,8 +9,6 @@ import scipy.stats
 from experiments import comparisons
 from experiments.comparisons import compare
 from experiments.curves import difference
-from experiments.figure_results import steps_until_solved
-from experiments.store import Record
 from gasil_jax.statistics import interquartile_mean
 
 
@@ -146,16 +144,6 @@ def test_the_exact_test_is_scipys(counts):
     assert comparisons.fisher_p(counts[0], 20, counts[1], 20) == pytest.approx(expected)
 
 
-def test_a_seed_solves_a_task_with_half_of_a_successs_return():
-    def until(*returns):
-        values = np.array(returns, float)
-        steps = 1000 * np.arange(1, len(values) + 1)
-        return steps_until_solved(Record(steps, values, values, {}), 1.0)
-
-    assert until(0, 0.6, 0, 1) == 2000 and until(0, 0.5) == 2000
-    assert until(0, 0.4) == until(1, 0.49) == until(0, np.nan) == np.inf
-
-
 def test_shares_are_compared_on_one_task_and_on_several():
     some = lambda count: np.arange(20) < count
     solved = {(p, "a"): some(18) for p in "xyz"} | {(p, "b"): some(4) for p in "xyz"}
@@ -172,11 +160,3 @@ def test_shares_are_compared_on_one_task_and_on_several():
     assert alone(one).visible == pytest.approx(2.8 * deviation, rel=0.05)
     pair = comparisons.judged({"one": one, "other": one})
     assert pair["one"].visible > alone(one).visible
-
-
-def test_every_task_counts_alike_in_the_mean():
-    """Tasks have other numbers of seeds; one with more seeds weighs alike."""
-    middle, low, high = comparisons.over_tasks("x", [np.full(8, 2.0), np.full(16, 4.0)])
-    assert middle == 3.0 and low == high == 3.0
-    middle, low, high = comparisons.mean_share([np.ones(8) > 0, np.zeros(20) > 0])
-    assert middle == low == high == 0.5

@@ -4,10 +4,8 @@ import contextlib
 import dataclasses
 import multiprocessing
 import os
-import shutil
 import signal
 import threading
-import types
 
 import jax
 import numpy as np
@@ -15,16 +13,13 @@ import pytest
 
 import gasil_jax
 from experiments import __main__, engine
-from experiments.curves import Curve, Figure, difference
+from experiments.curves import Curve, Figure
 from experiments.engine import Setup
 from experiments.figures import FIGURES
-from experiments.store import RESULTS, Record, Store, read
+from experiments.store import Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host import programs
-from gasil_jax.host.environments import Settings
 from gasil_jax.host.evaluations import evaluation_key
-from gasil_jax.host.interruption import Interrupted
 from gasil_jax.host.members import Members
 from gasil_jax.host.runs import Run
 
@@ -52,55 +47,6 @@ def trained(tmp_path_factory):
     with pytest.MonkeyPatch.context() as monkeypatch:
         told(monkeypatch, "c", True)
         return setup, program, engine.train(program, setup)
-
-
-def test_runs_share_a_program_that_differ_in_floats_and_seeds_alone():
-    other = [
-        run(hidden_sizes=(4,)),
-        run(num_envs=2),
-        dataclasses.replace(run(), settings=Settings(reward_delay=20)),
-        dataclasses.replace(run(), env="hopper"),
-    ]
-    folders = engine.unfinished([*RUNS, *other], Setup())
-    assert sorted(len(x.runs) for x in folders) == [1, 1, 1, 1, 3]
-    assert len({x.path for x in folders}) == 5
-    # The order in which runs are missing does not change a program.
-    assert engine.unfinished(RUNS[::-1], Setup(devices=1))[0] in folders
-    for setup in (Setup(physics="mujoco"), Setup(evaluate_episodes=0)):
-        (another,) = engine.unfinished(RUNS, setup)
-        assert another.path not in {x.path for x in folders}
-
-
-@pytest.mark.parametrize(
-    ("agent", "numbers", "others"),
-    [
-        (
-            "ppo+gasil",
-            {"alpha": 0.5, "discriminator_learning_rate": 1e-3},
-            {"buffer_steps": 64, "bonus": "airl", "alpha_schedule": ((1e3, 0.0),)},
-        ),
-        (
-            "ppo",
-            {"decomposition_learning_rate": 1e-4, "reward_clip": 5.0},
-            {"decomposition_updates": 7, "normalize_rewards": False},
-        ),
-    ],
-)
-def test_an_agents_and_a_models_numbers_are_no_program_of_their_own(
-    agent, numbers, others
-):
-    models = {"decompose_rewards": True, "normalize_rewards": True}
-    first = Run("point_mass", gasil_jax.algorithm(agent, **SMALL, **models), 0)
-    changed = lambda name, value: dataclasses.replace(
-        first, algorithm=first.algorithm.replace(**{name: value})
-    )
-    alike = {changed(name, value) for name, value in numbers.items()}
-    apart = {changed(name, value) for name, value in others.items()}
-    every = programs.group([first, *alike, *apart])
-    assert {frozenset(program.runs) for program in every} == {
-        frozenset({first, *alike}),
-        *(frozenset({one}) for one in apart),
-    }
 
 
 def test_shards_are_all_runs_once_and_none_moves_when_others_join():
@@ -158,29 +104,6 @@ def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
         assert again.provenance == before.provenance
 
 
-def test_training_is_continued_when_other_runs_are_missing(
-    trained, monkeypatch, tmp_path
-):
-    setup, program, _ = trained
-    setup = dataclasses.replace(setup, runs=tmp_path / "runs")
-    shutil.copytree(program.path.parent.parent, setup.runs)
-    (unfinished,) = setup.runs.glob("*/*/training.json")
-    unfinished.unlink()
-    resumed = dataclasses.replace(setup, resume=True)
-    requested = []
-    monkeypatch.setattr(engine, "train", lambda x, _: requested.append(x) or {})
-    another = dataclasses.replace(RUNS[0], seed=99)
-    missing = [another, *RUNS]
-    with pytest.raises(InputError, match=f"in {program.path.name}: continue it"):
-        engine.train_missing(missing, Store(tmp_path), setup)
-    engine.train_missing(missing, Store(tmp_path), resumed)
-    assert [set(x.runs) for x in requested] == [set(RUNS), {another}]
-    assert requested[0].path.name == program.path.name
-    # With other physics it is other training.
-    other = dataclasses.replace(setup, physics="mujoco")
-    assert not any(x.path.exists() for x in engine.unfinished(missing, other))
-
-
 def test_rows_are_means_over_equal_parts_of_training():
     returns = np.arange(120.0)
     returns[[0, 1, 2]], returns[5] = np.nan, np.nan
@@ -212,36 +135,12 @@ def beside(waiting):
         thread.join()
 
 
-def test_interrupted_training_is_continued_on_request_only(tmp_path):
-    store, setup = Store(tmp_path / "store"), Setup(tmp_path / "runs")
-    runs = [run(total_steps=10**9)]
-
-    def size():
-        return sum(
-            path.stat().st_size for path in tmp_path.glob("runs/*/*/metrics.csv")
-        )
-
-    def interrupt(before):
-        while size() <= before:
-            yield
-        os.kill(os.getpid(), signal.SIGTERM)
-
-    for resume in (False, True):
-        with beside(interrupt(size())), pytest.raises(Interrupted) as interrupted:
-            engine.train_missing(runs, store, dataclasses.replace(setup, resume=resume))
-        assert "--resume" in interrupted.value.__notes__[0]
-        assert list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))
-    with pytest.raises(InputError, match="--resume"):
-        engine.train_missing(runs, store, setup)
-    assert store.missing(runs) == runs
-
-
 @pytest.fixture
 def toy(monkeypatch):
     """A figure of two small curves on the point mass."""
     changes = {**SMALL, "total_steps": 512}
     curve = Curve("point_mass", "ppo", seeds=4, changes=changes)
-    other = dataclasses.replace(curve, agent="ppo+bonus")
+    other = dataclasses.replace(curve, changes={**changes, "gamma": 0.9})
     figure = Figure("Toy", "None.", {"a": {"x": curve, "y": other}}, favourite="x")
     monkeypatch.setitem(FIGURES, "matrix", figure)
     return figure
@@ -266,17 +165,8 @@ def test_a_figure_is_trained_from_end_to_end_and_in_shards(toy, tmp_path, capsys
     assert "matrix: 0 runs are missing" in capsys.readouterr().out
 
 
-def test_the_small_version_has_few_seeds_and_steps(tmp_path):
-    figure = __main__._small(FIGURES["matrix"], ["swimmer"])
-    assert list(figure.panels) == ["swimmer"] and not figure.searches
-    for _, _, curve in figure.curves():
-        assert (curve.seeds, curve.total_steps) == (3, 100_000)
-        assert len(curve.runs(Store(tmp_path))) == 3  # whatever is searched
-    assert list(__main__._small(FIGURES["matrix"], ()).panels) == ["hopper-delayed"]
-
-
-@pytest.mark.parametrize("name", FIGURES)
-def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
+@pytest.mark.parametrize("name", ["matrix", "delayed_rewards", "sparse_causes"])
+def test_the_page_of_a_small_version_can_be_written(name, tmp_path):
     """As if all of its runs were trained already."""
     results = tmp_path / "quick" / "results"
     store, made = Store(results / "runs"), {"physics": "jax", "versions": None}
@@ -287,121 +177,9 @@ def test_the_page_of_every_small_version_can_be_written(name, tmp_path):
     assert "![" in (results / f"{name}.md").read_text()
 
 
-def test_a_small_version_is_trained(toy, tmp_path, monkeypatch, capsys):
-    panels = {"a": toy.panels["a"], "b": toy.panels["a"]}
-    both = (*difference("a", "x", "y"), *difference("b", "y", "x"))
-    compared = {("a", "x", "y"): both[:2], ("b", "x", "y", "a"): both}
-    figure = dataclasses.replace(toy, panels=panels, comparisons=compared)
-    monkeypatch.setitem(FIGURES, "matrix", figure)
-    monkeypatch.setattr(__main__, "_QUICK_STEPS", 512)
-    arguments = ["--runs", str(tmp_path), "--evaluate-episodes", "0", "--devices", "1"]
-    assert __main__.main(["matrix", "--quick", *arguments]) == 0
-    page = (tmp_path / "quick" / "results" / "matrix.md").read_text()
-    assert "![" in page and len(list((tmp_path / "quick/results").glob("*.png")))
-
-
-def test_the_small_version_decomposes_rewards_where_the_figure_does(tmp_path):
-    figure = __main__._small(FIGURES["delayed_rewards"], ["hopper-delayed"])
-    decomposed = {
-        name: curve.runs(Store(tmp_path))[0].algorithm.settings["decompose_rewards"]
-        for _, name, curve in figure.curves()
-    }
-    assert decomposed["ppo (decomposed)"] and not decomposed["ppo"]
-
-
-def test_the_small_version_takes_names_of_searches_beside_a_panel(tmp_path, capsys):
-    # The default folder of results, given as a relative path, is no other folder.
-    results = ["--results", os.path.relpath(RESULTS)]
-    out = ["--runs", f"{tmp_path}", "--list", *results]
-    arguments = ["matrix", "--quick", "--only", "hopper-delayed", "hopper-delayed ppo"]
-    assert __main__.main([*arguments, *out]) == 0
-    assert "matrix: 24 runs are missing" in capsys.readouterr().out
-    assert __main__.main(["matrix", "--quick", "--only", "hopper ppo", *out]) == 2
-    assert "only is hopper ppo: --quick trains panels" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("nonsense",), "experiment 'nonsense' is unknown: it must be one of"),
-        (
-            ("matrix", "--only", "hoper"),
-            "only 'hoper' is unknown: did you mean 'hopper'",
-        ),
-        (("matrix", "--shard", "3/2"), "--shard: invalid shard value: '3/2'"),
-        (("matrix", "--devices", "0"), "--devices: 0: it must be 1 or more"),
-        (("matrix", "--quick", "--results", "x"), "results is x: --quick writes below"),
-        (("report", "--help-me"), "unrecognized arguments: --help-me"),
-        (("benchmark", "--tables", "speed"), "--tables: invalid choice: 'speed' (ch"),
-        (("benchmark", "--repeats", "x"), "--repeats: invalid int value: 'x'"),
-        (("benchmark", "--repeats", "9", "--page"), "page is set, but "),
-        (("profile", "--repeats", "9", "--page"), "page is set, but "),
-        (
-            # JAX is running with two devices.
-            "benchmark --devices 2 --tables scaling --training-envs 100".split(),
-            "num_envs is 100, which does not divide batch_steps 2048",
-        ),
-    ],
-)
-def test_bad_input_is_one_line_and_status_2(arguments, message, capsys):
-    assert __main__.main([*arguments]) == 2
-    error = capsys.readouterr().err
-    assert message in error and len(error.splitlines()) == 1
-
-
-def test_without_a_name_the_figures_are_listed(capsys):
-    assert __main__.main([]) == 0
-    printed = capsys.readouterr().out
-    assert all(name in printed for name in (*FIGURES, "report", "benchmark"))
-
-
 TWO_CORES = pytest.mark.skipif(
     len(os.sched_getaffinity(0)) < 2, reason="needs two cores"
 )
-
-
-class AtOnce:
-    """A process that stores records in place of training; that of seed 7 fails."""
-
-    def __init__(self, target, args):
-        _, self.stored, _, self.folder = args
-
-    def start(self):
-        # What waits for its end does not wait.
-        self.sentinel, other = os.pipe()
-        os.close(other)
-        self.exitcode = int(self.stored.seeds == (7,))
-        if not self.exitcode:
-            record = Record(*[np.ones(10)] * 3, {})
-            Store(self.folder).add(dict.fromkeys(self.stored.runs, record))
-
-    def join(self):
-        os.close(self.sentinel)
-
-
-@TWO_CORES
-def test_processes_train_what_is_missing_until_nothing_is(tmp_path, monkeypatch):
-    """The last run is only requested once the first is stored, as after a search.
-
-    One that fails, beside the first, keeps none from being trained.
-    """
-    at_once = types.SimpleNamespace(Process=AtOnce)
-    monkeypatch.setattr(multiprocessing, "get_context", lambda _: at_once)
-    store = Store(tmp_path / "store")
-    setup = Setup(tmp_path / "runs", processes=2, members=1)
-    first, _, last = RUNS
-
-    def missing():
-        stored = Store(store.folder)
-        later = [] if stored.missing([first]) else [last]
-        return stored.missing([first, run(7), *later])
-
-    with pytest.raises(InputError, match=r"1 programs failed: see .*\.log"):
-        engine.train_in_processes(missing, store, setup)
-    assert Store(store.folder).missing([*RUNS, run(7)]) == [RUNS[1], run(7)]
-    with pytest.raises(InputError, match=r"processes is 9999: it must be at most"):
-        many = dataclasses.replace(setup, processes=9999)
-        engine.train_in_processes(missing, store, many)
 
 
 @TWO_CORES

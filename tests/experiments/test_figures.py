@@ -1,18 +1,15 @@
 """The runs that the figures request."""
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
 
-import gasil_jax
 from experiments import search
-from experiments.curves import Arm, Curve, Figure, grid
+from experiments.curves import Curve
 from experiments.figures import FIGURES
-from experiments.search import DELAY, PAIR, Search
+from experiments.search import Search
 from experiments.store import RESULTS, Record, Store
-from gasil_jax import presets
 from gasil_jax.algorithms import check
 
 STORE = Store(RESULTS / "runs")
@@ -52,12 +49,6 @@ def test_a_curve_has_no_runs_before_its_search_has_chosen(tmp_path):
         assert runs[0].algorithm == first[0].algorithm
 
 
-def test_noise_is_trained_with_what_was_chosen_without():
-    for curves in FIGURES["stochastic_walker2d"].panels.values():
-        for curve in curves.values():
-            assert curve.search == Search("walker2d", curve.agent)
-
-
 def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
     monkeypatch.setattr(Search, "chosen", lambda *_: {"alpha": 0.2, "gamma": 0.99})
     curves = FIGURES["humanoid"].panels["humanoid"]
@@ -70,77 +61,3 @@ def test_a_curve_changes_what_was_chosen(tmp_path, monkeypatch):
     assert scheduled.replace(alpha=0.2, alpha_schedule=()) == fixed
     bare = dataclasses.replace(curves["ppo"], base="tuned", changes={})
     assert isinstance(bare, Curve) and bare.point(STORE) == {}
-
-
-SHARED = {"num_envs": 64, "normalize_rewards": True}
-DELAYS = Figure(
-    "Delays",
-    "",
-    grid(
-        ("hopper", "swimmer"),
-        PAIR,
-        (1, 5, 20, 1000),
-        panel="{env}",
-        curve="{arm}-{delay}",
-        base=None,
-        changes=SHARED,
-    ),
-    over=("reward_delay", "delay"),
-)
-
-
-def test_an_ablation_is_a_row():
-    weak = Arm("weak", "ppo+gasil", {"alpha": 0.01, "num_envs": 8})
-    arms = ("ppo", weak, "ppo+gasil")
-    panels = grid(("hopper", "ant"), arms, (DELAY,), base=None, changes=SHARED, seeds=5)
-    figure = Figure("Ablation", "", panels, favourite="ppo+gasil")
-    assert list(figure.panels) == ["hopper-delayed", "ant-delayed"]
-    for _, name, curve in figure.curves():
-        runs = curve.runs(STORE)
-        assert [run.seed for run in runs] == [0, 1, 2, 3, 4]
-        assert {run.settings.reward_delay for run in runs} == {DELAY}
-        agent = "ppo" if name == "ppo" else "ppo+gasil"
-        expected = gasil_jax.algorithm(agent, total_steps=1_000_000, **SHARED)
-        if name == "weak":
-            expected = expected.replace(alpha=0.01, num_envs=8)
-        assert runs[0].algorithm == expected
-    others = [key[1:] for key in figure.compared() if key[0] == "ant-delayed"]
-    assert others == [("ppo+gasil", "ppo"), ("ppo+gasil", "weak")]
-
-
-def test_a_figure_over_delays_is_a_row():
-    assert list(DELAYS.panels) == ["hopper", "swimmer"]
-    for _, name, curve in DELAYS.curves():
-        (run, *_) = curve.runs(STORE)
-        assert name == f"{run.algorithm.agent.name}-{run.settings.reward_delay}"
-        assert run.algorithm.config.num_envs == 64
-    # Agents are compared where the delay is the same.
-    others = [key[1:] for key in DELAYS.compared() if key[0] == "hopper"]
-    assert others == [(f"ppo+gasil-{x}", f"ppo-{x}") for x in (1, 5, 20, 1000)]
-
-
-def test_settings_by_the_dimension_are_the_preset_but_for_their_changes(tmp_path):
-    panels = FIGURES["action_dimension"].panels
-    for env, size, inverse, both in (
-        ("swimmer", 2, 1.0, (0.975, 0.9975)),
-        ("humanoid", 17, 2 / 17, (0.9, 0.99)),
-    ):
-        scaled = presets.preset(env, "ppo", "scaled", reward_delay=20)
-        by_root = scaled.replace(
-            learning_rate=1.5e-3 / size,
-            initial_std=1 / math.sqrt(size),
-            gae_lambda=1 - math.sqrt(size) / 40,
-        )
-        algorithms = [
-            curve.runs(Store(tmp_path))[0].algorithm
-            for name, curve in panels[f"{env}-delayed"].items()
-            if name != "ppo"
-        ]
-        assert scaled.settings["decompose_rewards"]
-        assert algorithms == [
-            scaled,
-            by_root,
-            by_root.replace(gae_lambda=0.95),
-            by_root.replace(gae_lambda=0.95, initial_std=inverse),
-            by_root.replace(gae_lambda=both[0], gamma=both[1]),
-        ]

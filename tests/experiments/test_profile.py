@@ -1,14 +1,12 @@
 """The profile's table, and the parts that operations belong to."""
 
-import functools
 from types import SimpleNamespace
 
 import jax
 import pytest
 
 from experiments import __main__ as experiments
-from experiments import benchmark, measured, profile
-from gasil_envs.physics import batching
+from experiments import measured, profile
 
 
 @pytest.fixture
@@ -98,39 +96,3 @@ xla_cpu_small_call="true"}, metadata={op_name="jit(f)/vmap(physics)/jit(tiled)"}
         "sort.1": "PPO: permutations",
         "add.1": "the rest",
     }
-
-
-def test_what_a_benchmark_measured_is_a_line_for_each_task():
-    row = lambda env, name, num_envs, speed: benchmark.Row(
-        *(env, name, num_envs, None), compile_seconds=speed / 100, speed=speed
-    )
-    rows = [row("ant", "mjx", 8, 1e3), row("ant", "ours", 8, 2e3)]
-    head, lines = benchmark.for_page(rows)
-    assert head == ["ant", "environments", "steps/s", "compile s"]
-    assert lines == [["mjx", "8", "1,000", "10"], ["ours", "8", "2,000", "20"]]
-    more = [row("hopper", "mjx", 8, 3e3), row("hopper", "ours", 8, 4e3)]
-    head, lines = benchmark.for_page([*rows, *more])
-    assert head == ["steps/s", "mjx", "ours", "compile s"]
-    assert lines[1] == ["hopper", "3,000", "4,000", "30, 40"]
-    for one in (*rows, *more):
-        one.error = one.speed * 1e-10
-    head, lines = benchmark.for_page([*rows, *more])
-    assert head[-1] == "errors of a step" and lines[1][-1] == "3e-07, 4e-07"
-    rows[1].error = None  # MuJoCo Warp's is not measured.
-    assert benchmark.for_page([*rows, *more])[1][0][-1] == "1e-07"
-    many = [row(env, "ours", n, n) for env in ("ant", "hopper") for n in (8, 2048)]
-    assert benchmark.for_page(many)[0][1:3] == ["8: ours", "2,048: ours"]
-
-
-def test_mjx_is_timed_in_a_process_without_the_option_of_our_loops(monkeypatch):
-    monkeypatch.setattr(benchmark, "_FLAGS", "")
-    monkeypatch.setenv("XLA_FLAGS", "")
-    batching.keep_loops("jax")
-    option = "'disable_loop_unrolling' in __import__('os').environ['XLA_FLAGS']"
-    build = functools.partial(
-        benchmark.Row, "ant", "mjx", 8, functools.partial(eval, option)
-    )
-    assert build().run() and benchmark._row("ours", build).run()
-    row = benchmark._row("mjx", build)
-    assert (row.name, row.num_envs) == ("mjx", 8)
-    assert row.run() == row.run() == 0.0

@@ -8,7 +8,6 @@ import pytest
 from experiments import search
 from experiments.search import (
     AGENTS,
-    CELLS,
     SPACES,
     TASKS,
     Search,
@@ -75,16 +74,6 @@ def test_a_point_that_ended_no_episode_is_not_chosen(tmp_path):
     drawn = one.points(store)
     fill(store, one, drawn, [np.nan, 2.0, *[1.0] * (len(drawn) - 2)])
     assert one.points(store)[len(drawn) :] == tuple(search.beyond("ppo", drawn[1]))
-
-
-def test_delayed_rewards_are_decomposed_for_two_curves():
-    decomposed = {
-        (delay, name)
-        for _, delay in CELLS
-        for name, one in search.searches("hopper", delay).items()
-        if one.algorithm({}).settings["decompose_rewards"]
-    }
-    assert decomposed == {(20, "ppo+gasil-adaptive"), (20, "ppo (decomposed)")}
 
 
 def test_one_point_for_all_delayed_tasks_has_the_best_mean_rank(tmp_path):

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 import gasil_jax
-from experiments.search import ADAPTIVE, AGENTS, DELAY, PAIR, PAPERS, TASKS, Search
+from experiments.search import ADAPTIVE, AGENTS, DELAY, PAIR, TASKS, Search
 from experiments.store import RESULTS, Store
 
 
@@ -23,13 +23,3 @@ def test_the_tuned_rows_are_what_the_searches_chose(env, reward_delay):
         others = [dataclasses.replace(search, chooser=x) for x in PAIR]
         tuned = gasil_jax.preset(env, agent, reward_delay=reward_delay)
         assert tuned in [x.algorithm(x.chosen(store)) for x in (search, *others)]
-
-
-def test_a_tuned_row_is_the_one_that_returns_most():
-    """On humanoid that is with the values of PPO's search, for all agents."""
-    rows = {x: gasil_jax.preset("humanoid", x).config for x in PAPERS}
-    assert {x.gae_lambda for x in rows.values()} == {0.9}
-    assert {x.initial_std for x in rows.values()} == {0.25}
-    store = Store(RESULTS / "runs")
-    own = Search("walker2d", "ppo+gasil")
-    assert gasil_jax.preset("walker2d") == own.algorithm(own.chosen(store))

@@ -41,13 +41,6 @@ def test_one_is_as_good_as_its_score_says(capsys):
     assert abs(mean - about["mean"]) < 5 * error + 1.0
 
 
-def test_a_name_that_it_lacks_is_told(capsys):
-    assert evaluate.main(["zoo:walker", "--gymnasium"]) == 2
-    assert "policy of the zoo 'walker' is unknown: did" in capsys.readouterr().err
-    assert evaluate.main(["zoo:swimmer-delayed", "--point", "1"]) == 2
-    assert "it has no points and no checkpoints" in capsys.readouterr().err
-
-
 def test_a_better_policy_replaces_another(untrained_hopper, tmp_path):
     run, kept = tmp_path / "run", tmp_path / "zoo"
     shutil.copytree(untrained_hopper, run)

@@ -86,12 +86,9 @@ def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
     (figure,) = figures
     alpha, rule, gamma = figure.axes
     assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
-    assert rule.get_xlabel() == "imitation rule" and gamma.get_xscale() == "linear"
-    assert [x.get_text() for x in alpha.get_xticklabels()] == ["0.02", "0.1", "1"]
     assert [x.get_text() for x in rule.get_xticklabels()] == ["gap", "both", "fixed"]
-    means, dots, star = alpha.get_lines()
+    means, _, star = alpha.get_lines()
     np.testing.assert_allclose(means.get_ydata(), [1.0, 4.0, 7.0])
-    np.testing.assert_array_equal(dots.get_xdata(), values["alpha"])
     assert (star.get_xdata(), star.get_ydata()) == (1.0, 8.0)
     np.testing.assert_allclose(rule.get_lines()[0].get_ydata(), [3.0, 4.0, 5.0])
     np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), returns)
@@ -125,18 +122,6 @@ def test_a_sweep_is_sorted_and_the_best_points_have_curves(figures, tmp_path):
     assert [x.get_ydata()[-1] for x in curves.get_lines()] == [3.5, 1.5]
     assert [x.get_label() for x in curves.get_lines()] == ["1", "0"]
     assert curves.get_xlabel() == "steps" and figure.get_suptitle() == "hopper, ppo"
-
-
-def test_a_short_run_is_drawn_in_thousands_and_ticks_have_no_offset(figures, tmp_path):
-    steps = np.arange(1, 11) * 4000.0
-    returns = 500.0 + np.linspace(0, 0.01, 10) * np.ones((2, 1))
-    plotting.learning_curve(tmp_path / "x.png", steps, returns, title="hopper, ppo")
-    (axes,) = figures[0].axes
-    assert axes.get_xlabel() == "thousand steps of a seed"
-    assert axes.get_lines()[0].get_xdata()[-1] == 40.0
-    figures[0].draw_without_rendering()
-    assert axes.yaxis.get_offset_text().get_text() == ""
-    assert axes.get_title() == "hopper, ppo"
 
 
 def test_a_moving_mean_is_of_the_points_before():

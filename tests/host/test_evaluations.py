@@ -1,27 +1,22 @@
 """Policies are evaluated during training."""
 
-import csv
 import json
-import logging as standard_logging
 import os
-import re
 import shutil
 import signal
 
-import jax
 import numpy as np
 import pytest
-from small_training import FLAGS, SETTINGS
+from small_training import FLAGS, table
 from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.evaluation import evaluate as evaluate_directly
-from gasil_jax.host import checkpoint, saved, tables, trackers
+from gasil_jax.host import checkpoint, saved
 from gasil_jax.host.evaluations import Evaluation, evaluation_key
-from gasil_jax.host.members import make_members
 
-ITERATIONS, EVERY, EPISODES = 22, 5, 3
+ITERATIONS, EPISODES = 22, 3
 SEEDS = (5, 6, 7)
 # Three members on two devices: one is padding.
 SMALL = (
@@ -35,36 +30,16 @@ EVALUATED = ("--evaluate-every", "600", "--evaluate-episodes", str(EPISODES))
 TOLERANCE = {"rtol": 2e-3, "atol": 2e-4}
 
 
-class Collector:
-    """A tracker that keeps the metrics that it gets."""
-
-    taken: list = []  # noqa: RUF012
-
-    def __init__(self, folder, name, config, members):
-        pass
-
-    def log(self, step, metrics):
-        self.taken.append((step, dict(metrics)))
-
-    def close(self):
-        pass
-
-
 @pytest.fixture(scope="module")
 def evaluated(tmp_path_factory):
-    """The folder of a run with evaluations, and the metrics of its tracker."""
+    """The folder of a run with evaluations."""
     out = tmp_path_factory.mktemp("evaluated") / "out"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(trackers.TRACKERS, "collector", ("json", Collector))
-        patch.setattr(Collector, "taken", [])
-        arguments = (*SMALL, *EVALUATED, "--log", "collector", "--out", str(out))
-        assert run.main(arguments) == 0
-        yield out, list(Collector.taken)
+    assert run.main([*SMALL, *EVALUATED, "--out", str(out)]) == 0
+    return out
 
 
 def rows(out):
-    with (program_of(out) / "evaluations.csv").open() as file:
-        return list(csv.DictReader(file))
+    return table(program_of(out) / "evaluations.csv")
 
 
 def assert_same_tables(first, second):
@@ -85,31 +60,30 @@ def means(out):
 def test_every_seed_has_a_row_for_each_evaluation_and_the_last_policy_is_scored(
     evaluated,
 ):
-    out, _ = evaluated
-    table = rows(out)
+    scores = rows(evaluated)
     names = ["point", "seed", "env_steps", "mean", "min", "max", "length"]
-    assert list(table[0]) == names
-    assert [(int(row["env_steps"]), int(row["seed"])) for row in table] == [
+    assert list(scores[0]) == names
+    assert [(int(row["env_steps"]), int(row["seed"])) for row in scores] == [
         (iteration * 128, seed)
         for iteration in (0, 5, 10, 15, 20, 22)
         for seed in SEEDS
     ]
-    for row in table:
+    for row in scores:
         low, mean, high = (float(row[name]) for name in ("min", "mean", "max"))
         assert low <= mean <= high and row["length"] == "50"
-    summary = json.loads((out / "summary.json").read_text())
+    summary = json.loads((evaluated / "summary.json").read_text())
     (point,) = summary["points"]
-    last = [float(row["mean"]) for row in table[-3:]]
+    last = [float(row["mean"]) for row in scores[-3:]]
     assert point["final_evaluation"] == pytest.approx(np.mean(last))
     assert point["final_length"] == 50.0
-    with (out / "results.csv").open() as file:
-        written = [float(row["final_evaluation"]) for row in csv.DictReader(file)]
+    results = table(evaluated / "results.csv")
+    written = [float(row["final_evaluation"]) for row in results]
     assert written == pytest.approx(last)
     assert summary["evaluation_seconds"] > 0
 
 
 def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
-    out, alone = evaluated[0], tmp_path / "alone"
+    out, alone = evaluated, tmp_path / "alone"
     assert run.main([*SMALL, "--out", str(alone)]) == 0
     tables_ = [program_of(x) / "metrics.csv" for x in (out, alone)]
     assert tables_[0].read_bytes() == tables_[1].read_bytes()
@@ -119,9 +93,8 @@ def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
 
 
 def test_the_scores_are_those_of_evaluate(evaluated):
-    out, _ = evaluated
-    env, algorithm, seeds, states = saved.load(out)
-    for index, (seed, row) in enumerate(zip(seeds, rows(out)[-3:], strict=True)):
+    env, algorithm, seeds, states = saved.load(evaluated)
+    for index, (seed, row) in enumerate(zip(seeds, rows(evaluated)[-3:], strict=True)):
         scores = evaluate_directly(
             env,
             algorithm,
@@ -136,8 +109,7 @@ def test_the_scores_are_those_of_evaluate(evaluated):
 
 
 def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
-    whole, _ = evaluated
-    out = tmp_path / "out"
+    whole, out = evaluated, tmp_path / "out"
     shutil.copytree(whole, out)
     # As if it had been killed after the checkpoint in the middle of two evaluations.
     (program_of(out) / "training.json").unlink()
@@ -152,16 +124,14 @@ def test_a_resumed_run_scores_the_same_again(evaluated, tmp_path):
     assert_same_tables(out, whole)
 
 
-@pytest.mark.parametrize(("at", "scored"), [(0, ["0"]), (10, ["0", "640"])])
-def test_an_interrupted_run_continues_with_its_scores(
-    at, scored, evaluated, tmp_path, monkeypatch
+def test_a_run_that_is_stopped_before_it_trains_scores_each_policy_once(
+    evaluated, tmp_path, monkeypatch
 ):
-    """Even one that is stopped before it trains scores each policy once."""
-    whole, out = evaluated[0], tmp_path / "out"
+    whole, out = evaluated, tmp_path / "out"
     score = Evaluation.score
 
     def interrupted(self, states, done):
-        if done == at:
+        if done == 0:
             os.kill(os.getpid(), signal.SIGTERM)
         return score(self, states, done)
 
@@ -169,14 +139,13 @@ def test_an_interrupted_run_continues_with_its_scores(
         patch.setattr(Evaluation, "score", interrupted)
         status = run.main([*SMALL, *EVALUATED, "--out", str(out)])
     assert status == 128 + signal.SIGTERM
-    assert [row["env_steps"] for row in rows(out)[::3]][: len(scored)] == scored
+    assert [row["env_steps"] for row in rows(out)[::3]][:1] == ["0"]
     assert run.main(["--resume", "--out", str(out)]) == 0
     assert_same_tables(out, whole)
 
 
 def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
-    out, _ = evaluated
-    root, by_iteration = program_of(out) / "checkpoints", means(out)
+    root, by_iteration = program_of(evaluated) / "checkpoints", means(evaluated)
     del by_iteration[0]  # Of the untrained policy there is no checkpoint.
     best = max(by_iteration, key=by_iteration.__getitem__)
     assert checkpoint.best(root).iteration == best
@@ -192,49 +161,5 @@ def test_the_best_checkpoint_is_that_of_the_best_evaluation(evaluated):
     assert set(scores) == {8, 16, ITERATIONS} | so_far
     for iteration, score in scores.items():
         assert score == pytest.approx(by_iteration.get(iteration))
-    _, _, _, states = saved.load(out, "best")
+    _, _, _, states = saved.load(evaluated, "best")
     assert set(np.asarray(states.iteration)) == {best}
-
-
-def test_the_tracker_is_given_the_scores(evaluated):
-    out, taken = evaluated
-    given = {step: x["evaluation"] for step, x in taken if "evaluation" in x}
-    expected = {}
-    for row in rows(out):
-        expected.setdefault(int(row["env_steps"]), []).append(float(row["mean"]))
-    assert set(given) == set(expected)
-    for step, scores in given.items():
-        np.testing.assert_allclose(scores, expected[step], rtol=1e-5)
-
-
-def scored(tmp_path, seeds, devices, times=1):
-    """Return the mean, lowest and highest return of each seed's amplified policy."""
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    algorithm = gasil_jax.algorithm("ppo", **SETTINGS)
-    members = make_members(env, algorithm, seeds, devices=jax.devices()[:devices])
-    states = members.init()
-    # The first policies hardly move.
-    params = jax.tree.map(lambda x: 30 * x, states.actor_critic)
-    states = states.replace(actor_critic=params)
-    path = tmp_path / f"{devices}.csv"
-    table = tables.TableWriter(path, {"seed": seeds}, columns=Evaluation.COLUMNS)
-    evaluation = Evaluation(members, every=128, num_episodes=4, table=table)
-    for _ in range(times):
-        evaluation.score(states, 1)
-    table.close()
-    with path.open() as file:
-        table = list(csv.DictReader(file))
-    return {
-        int(row["seed"]): [float(row[x]) for x in ("mean", "min", "max")]
-        for row in table
-    }
-
-
-def test_a_seeds_scores_are_its_own_and_compile_once(tmp_path, caplog):
-    with jax.log_compiles(), caplog.at_level(standard_logging.WARNING):
-        together = scored(tmp_path, [5, 6, 7], devices=2, times=3)
-        names = re.findall(r"Finished XLA compilation of (\S+)", caplog.text)
-    assert names.count("jit(score)") == 1
-    alone = scored(tmp_path, [6], devices=1)
-    np.testing.assert_allclose(alone[6], together[6], **TOLERANCE)
-    assert np.abs(np.subtract(together[5], together[6])).max() > 0.1

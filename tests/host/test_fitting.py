@@ -17,9 +17,8 @@ from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import evaluate, plot, render, run
-from gasil_jax.host import checkpoint, fitting, saved
+from gasil_jax.host import checkpoint, saved
 from gasil_jax.host.interruption import Interrupted
-from gasil_jax.host.sweep import Recording
 
 # Iterations, the longest of a chunk, and the algorithm of both ways to train.
 ITERATIONS, CHUNK = 100, 2
@@ -259,35 +258,3 @@ def test_what_no_command_line_can_name_is_read_where_it_can_be(own, tmp_path, ca
         gasil_jax.load_reward(out, env=own)
     with pytest.raises(ValueError, match=r"run is .*env 'PointMass' is unknown"):
         gasil_jax.load_reward(out, algorithm=gasil)
-
-
-BEGUN = {"folder": "begun", "resume": True, "evaluate_every": 128}
-
-
-@pytest.mark.parametrize(
-    ("changes", "why"),
-    [
-        ({"seeds": jnp.zeros(2, int)}, r"seeds is \[0, 0\]: it must be different"),
-        ({"seeds": [-1]}, "different whole numbers"),
-        ({"checkpoint_every": 128}, "checkpoint_every is 128: it needs a folder"),
-        ({"resume": True}, "resume is True: it needs a folder"),
-        ({"folder": "/proc/none"}, "folder is /proc/none"),
-        ({"folder": "full"}, "folder is .* not empty"),
-        (BEGUN | {"evaluate_every": None}, "evaluate_every was 128, is None"),
-        (BEGUN | {"evaluate_every": 256}, "evaluate_every was 128, is 256: only total"),
-        (BEGUN | {"evaluate_episodes": 3}, "evaluate_episodes was 10, is 3: only tot"),
-        ({"points": []}, r"points is \[\]: it must be a list of at least one dict"),
-        ({"points": [{"alpha": 1.0}]}, "alpha is a setting of .*, not of ppo"),
-        ({"points": [{"num_epochs": 2}]}, "num_epochs is not traced"),
-    ],
-)
-def test_what_is_wrong_is_refused_by_name(own, changes, why, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "file").touch()
-    if changes.get("folder") == "begun":
-        begun = fitting._describe(own, PPO, [0], Recording(evaluate_every=128))
-        (tmp_path / "begun").mkdir()
-        begun.write(tmp_path / "begun")
-    with pytest.raises(ValueError, match=why):
-        gasil_jax.fit(own, **{"algorithm": PPO, **changes})

@@ -19,6 +19,7 @@ import pytest
 import test_members
 from refusals import refused
 from small_training import FLAGS
+from test_checkpoints import assert_same
 
 from gasil_jax import run
 from gasil_jax.cli import reporting
@@ -27,7 +28,7 @@ from gasil_jax.host import checkpoint, devices, folders
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.members import Members
 
-ITERATIONS = 240
+ITERATIONS = 160
 # Of the states with a buffer PPO+BC's compiles soonest; other agents': below.
 SMALL = (
     *(*FLAGS, "--agent", "ppo+bc", "--seeds", "3", "--devices", "2"),
@@ -37,13 +38,11 @@ SMALL = (
 OFTEN = ("--checkpoint-every", str(20 * 128))
 
 
-def start(out, *arguments, cache=None):
-    """Start a run, which may have a user's own cache of compiled programs."""
-    mine = dict(os.environ)
-    if cache is not None:
-        for tests_own in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
-            mine.pop(tests_own)
-        mine["XDG_CACHE_HOME"] = str(cache)
+def start(out, *arguments, cache):
+    """Start a run with a user's own cache of compiled programs."""
+    mine = os.environ | {"XDG_CACHE_HOME": str(cache)}
+    for of_tests in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
+        del mine[of_tests]
     return subprocess.Popen(
         [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
         env=mine,
@@ -106,7 +105,7 @@ class Undisturbed(NamedTuple):
 def undisturbed(tmp_path_factory, cache):
     out, memory = tmp_path_factory.mktemp("whole") / "out", []
     both = [start(out, *SMALL, "--resume", cache=cache) for _ in range(2)]
-    for iterations in (60, 120, 180, 230):
+    for iterations in (40, 80, 120, 150):
         wait_for(lambda: rows(out) > 3 * iterations, *both)  # noqa: B023
         lock = (program_of(out) / ".lock").read_text()
         pid = int(re.match(r"process (\d+)", lock).group(1))
@@ -235,7 +234,6 @@ def test_a_new_folder_has_a_name_of_its_own(tmp_path, monkeypatch):
         (lambda text: text[: len(text) // 2], "damaged: it lacks iterations"),
         (lambda text: text.replace(b",", b"", 9), "metrics.csv is damaged: row 1 has"),
         (lambda text: text.replace(b",0.", b",z."), "damaged: could not convert"),
-        (lambda text: b"\xff" + text, "damaged"),
     ],
 )
 def test_a_damaged_table_is_told_in_a_line(edit, message, copy, capsys):
@@ -310,44 +308,22 @@ def test_a_run_continues_from_the_checkpoint_before_a_damaged_one(
     assert (root / f"{last}.damaged").is_dir()
 
 
-# States with a discriminator and a buffer, and with a replay and a model of rewards;
-# what others have is arrays too, and test_checkpoints.py writes those of any kind.
-@pytest.mark.parametrize(
-    "agent",
-    [
-        pytest.param(name, marks=pytest.mark.xdist_group(f"members {name}"))
-        for name in ("ppo+gasil", "ppo+sil")
-    ],
-)
-def test_an_agent_continues_bit_for_bit(agent, tmp_path):
-    members, first, advance = test_members.compiled(agent)
-    rest = []
+@pytest.mark.xdist_group("members")
+def test_an_agent_continues_bit_for_bit(tmp_path):
+    members, first, advance = test_members.compiled()
     states, _ = members.train(advance, members.to_devices(first), 0, 1)
     states, _ = members.train(advance, states, 1, 1)
     record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
     checkpoint.write(tmp_path, 2, members.trim(states), record)
     newest, _ = checkpoint.latest(tmp_path)
-    like = jax.eval_shape(lambda: first)
-    for before in (states, members.to_devices(newest.restore(like))):
-        after, metrics = members.train(advance, before, 2, 1)
-        after, more = members.train(advance, after, 3, 1)
-        after = jax.tree.leaves(members.trim(after))
-        rest.append(
-            [
-                metrics,
-                more,
-                [
-                    np.asarray(jax.device_get(x))
-                    for x in after
-                    if not jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key)
-                ],
-            ]
-        )
-    jax.tree.map(np.testing.assert_array_equal, *rest)
+    restored = newest.restore(jax.eval_shape(lambda: first))
+    (after, metrics), (again, same) = (
+        members.train(advance, before, 2, 1)
+        for before in (states, members.to_devices(restored))
+    )
+    assert_same(members.trim(again), members.trim(after))
+    jax.tree.map(np.testing.assert_array_equal, same, metrics)
     # It has trained all the while, with delay and noise and without a NaN.
-    metrics, _, leaves = rest[0]
     assert metrics["skipped_updates"].sum() == 0
     assert np.isfinite(metrics["policy_loss"]).all()
-    if "buffer_steps" in members.algorithm.settings:
-        assert (metrics["good_steps"] == 100).all()
-    assert len(leaves) > 20
+    assert (metrics["good_steps"] == 100).all()

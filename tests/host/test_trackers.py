@@ -1,7 +1,6 @@
 """Metrics in TensorBoard and Weights & Biases."""
 
 import sys
-import time
 import types
 
 import numpy as np
@@ -75,7 +74,8 @@ def test_a_run_in_tensorboard_with_films(tmp_path, monkeypatch, capsys):
     out, plain = tmp_path / "out", tmp_path / "plain"
     small = (*SMALL, "--no-stagger-episodes", "--video-every", "100")
     more = ("--log", "tensorboard", "--out", str(out))
-    assert run.main([*small, *more]) == 0
+    scored = ("--evaluate-every", "128", "--evaluate-episodes", "2")
+    assert run.main([*small, *scored, *more]) == 0
     films = [*out.glob("programs/*/videos/*")]
     assert sorted(x.name for x in films) == ["00000128.gif", "00000256.gif"]
     assert all(Image.open(x).size == (320, 240) for x in films)
@@ -93,66 +93,30 @@ def test_a_run_in_tensorboard_with_films(tmp_path, monkeypatch, capsys):
     (path,) = out.glob("programs/*/tensorboard/*")
     content = path.read_bytes()
     assert content.count(b"mean/policy_loss") == 2
+    # Before training, and after each of the iterations.
+    assert content.count(b"mean/evaluation") == 3
     # Episodes of 50 steps end in the second iteration.
     for name in (b"mean/episode_return", b"episode_return/0-3", b"episode_return/0-4"):
         assert content.count(name) == 1
     assert content.count(b"GIF89a") == content.count(b"video/0-3") == 2
 
 
-@pytest.mark.slow
-def test_a_run_in_wandb_without_an_account(tmp_path, monkeypatch):
-    pytest.importorskip("wandb")
-    # wandb replaces it, and other tests look at what exits.
-    monkeypatch.setattr(sys, "exit", sys.exit)
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    out = tmp_path / "out"
-    out.mkdir()
-    members = {"3": {"seed": 3}, "4": {"seed": 4}}
-    # A run, and its continuation with more steps.
-    for total_steps, steps in ((256, [128, 256]), (384, [384])):
-        config = {"total_steps": total_steps}
-        (tracker,) = trackers.make(
-            ["wandb"], out, run_name="alpha-2", config=config, members=members
-        )
-        returns = np.float32([[0.5] * len(steps), [1.0] * len(steps)])
-        metrics = {"env_steps": np.array([steps] * 2), "episode_return": returns}
-        trackers.log([tracker], metrics)
-        tracker.close()
-        time.sleep(1.1)  # W&B names its folders by the second.
-    identifier = (out / "wandb-id").read_text()
-    for label in members:
-        name = f"run-{identifier}-{label}.wandb"
-        paths = sorted(out.glob(f"wandb/offline-run-*/{name}"))
-        for path, count in zip(paths, (2, 1), strict=True):
-            assert path.read_bytes().count(b"episode_return") >= count
-    # Another run in a folder of the same name is another one there.
-    (tmp_path / "other" / "out").mkdir(parents=True)
-    assert trackers._identifier(tmp_path / "other" / "out" / "wandb-id") != identifier
-
-
-def first_made(monkeypatch, program, *arguments):
-    """Return the name and the settings of the first run that trackers are told of."""
+def test_a_program_of_a_sweep_is_told_with_its_own_values(
+    tmp_path, monkeypatch, capsys
+):
+    """And with the name of the sweep's folder."""
+    monkeypatch.chdir(tmp_path)
     told = []
 
     def make(names, folder, *, run_name, config, members):
-        told.append((run_name, config))
+        told.append((run_name, config["num_epochs"]))
         raise InputError("enough")
 
     monkeypatch.setattr(trackers, "make", make)
     monkeypatch.setattr(trackers, "check", lambda names: None)
-    log = ("--log", "tensorboard")
-    assert program.main([*SMALL, *log, *map(str, arguments)]) == 2
-    (first,) = told
-    return first
-
-
-def test_runs_have_the_names_of_their_folders(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert first_made(monkeypatch, run, "--out", "programs/7")[0] == "7"
-    grid = ("--grid", "num_epochs=2,3", "--out", "beta")
-    name, config = first_made(monkeypatch, sweep, *grid)
-    # A program of a sweep is told with its own values.
-    assert (name, config["num_epochs"]) == ("beta", 2)
+    grid = ("--grid", "num_epochs=2,3", "--out", "programs/7")
+    refused(capsys, sweep, *SMALL, "--log", "tensorboard", *grid)
+    assert told == [("7", 2)]
 
 
 def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, capsys):
@@ -174,10 +138,9 @@ def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, ca
     mode, printed = started()
     assert mode == "offline" and "no API key" in printed
     assert len(printed.splitlines()) == 1
-    for name, value in (("WANDB_API_KEY", "key"), ("WANDB_MODE", "online")):
-        with monkeypatch.context() as patch:
-            patch.setenv(name, value)
-            assert started() == (None, "")
+    with monkeypatch.context() as patch:
+        patch.setenv("WANDB_API_KEY", "key")
+        assert started() == (None, "")
     login = "machine api.wandb.ai\n  login user\n  password key\n"
     (tmp_path / ".netrc").write_text(login)
     assert started() == (None, "")
