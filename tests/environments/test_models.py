@@ -185,6 +185,7 @@ def test_generated_models_are_mujocos(part):
             ),
             "equalities of bodies",
         ),
+        (drop().replace('pos="0 0 0.15"', 'pos="0 0 -0.5"'), "deep in each other"),
     ],
 )
 def test_where_mjx_is_not_mujoco_is_told(xml, what):
