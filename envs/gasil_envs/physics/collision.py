@@ -149,6 +149,14 @@ def stay_parallel(model: mujoco.MjModel, geoms: np.ndarray) -> bool:
     return bool(parallel.any())
 
 
+def depth(model: mujoco.MjModel) -> float:
+    """Return how deep the deepest contact is at the start, in sizes of a body."""
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    size = max(model.stat.meansize, mujoco.mjMINVAL)
+    return -float(data.contact.dist.min(initial=0.0)) / size
+
+
 class Segments(NamedTuple):
     """The lines along the middle of geoms, metres.
 

@@ -115,16 +115,14 @@ def make(
 ) -> Dynamics:
     """Compute what does not depend on the state, for a supported model."""
     model = _enabled(model)
-    layout, data = constraints.layout(model), mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    deepest = -data.contact.dist.min(initial=0.0)
+    layout = constraints.layout(model)
     return Dynamics(
         model,
         layout,
         actuators.make(model),
         tendons.fixed(model),
         (iterations, ls_iterations),
-        layout.stiffness > _STIFF or deepest > _DEEP * model.stat.meansize,
+        layout.stiffness > _STIFF or constraints.collision.depth(model) > _DEEP,
         tuple(fields),
     )
 

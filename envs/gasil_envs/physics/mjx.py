@@ -86,6 +86,7 @@ def differences(model: mujoco.MjModel) -> list[str]:
         ).any(),
         "friction below 1e-5": (frictions < mujoco.mjMINMU).any(),
         "solimp of width 0": any((x[:, 2] <= mujoco.mjMINVAL).any() for x in solimps),
+        "bodies that start deep in each other": collision.depth(model) > 1.0,
         "equalities of bodies": (model.eq_type <= int(mujoco.mjtEq.mjEQ_WELD)).any(),
         "turning of free bodies with implicitfast": (
             model.opt.integrator == implicitfast and tree.has_lone_bodies(model)

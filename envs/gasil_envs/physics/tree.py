@@ -38,7 +38,7 @@ FREE, BALL, SLIDE, HINGE = (
 _NEGLIGIBLE = 1e-9
 #: From this distance from the origin on, metres and sizes of a body, and this condition
 #: of the joint-space inertia on, rounding costs more than 1e-5 of a step.
-_FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 1e3
+_FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 800.0
 
 
 class Kinematics(NamedTuple):
