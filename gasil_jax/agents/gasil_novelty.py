@@ -2,30 +2,31 @@
 
 PPO maximizes the environment's reward r, a bonus b from the discriminator in its
 centred form, which pays nothing on average (see `adversarial`), and one for novelty n
-(see `novelty`), each with a weight from 0 to 1 that follows returns:
+(see `novelty`), both with weights that follow the policy's returns:
 
-    r + alpha q (b - its mean) + novelty_coefficient (1 - p) (n - its mean).
+    r + (1 - p) (alpha q b + novelty_coefficient (n - its mean over the batch)).
 
 Let m be the mean return of the policy's whole episodes over the latest batches,
 discounted as the buffer ranks them, M and S mean and standard deviation over five times
-as many, and m_0 the lowest m so far.
-
-Exploration fades with the learning progress (Oudeyer, Kaplan and Hafner 2007), here the
-rise of the returns in units of their spread:
+as many, and m_0 the lowest m so far. Then p is the learning progress (Oudeyer, Kaplan
+and Hafner 2007), the rise of the returns in units of half their spread,
 
     p = clip(2 (m - M) / S, 0, 1).
 
 So where PPO learns by itself, as from dense rewards, it is left alone; where nothing is
-rewarded, or returns have come to a stand, it explores.
+rewarded, or returns have come to a stand, it explores and imitates.
 
 Of the buffer, only episodes with a return above m are imitated, as self-imitation
 learning (Oh et al. 2018) uses steps whose return is above the value. With R the mean
 return over their steps, and R_1 the best return,
 
-    q = clip((R - m) / (R_1 - m_0), 0, 1),
+    q = clip((R - m) / (R_1 - m_0 + 0.01 s), 0, 1),
 
-the share of all that was gained since the start that the policy still lacks. If no
-episode is better than the policy, as before the first reward, it imitates nothing.
+the share of all that was gained since the start that the policy still lacks; 0 if no
+episode is better. The buffer ranks episodes by their return plus 0.001 s times their
+mean novelty, from 0 to 1, like PPO+BC+NOVELTY's. So where all returns are equal, as
+before the first reward, the policy imitates what is new, with a weight q below 0.1. The
+number s is what rewards are divided by, so that their unit does not matter.
 """
 
 from typing import Any
@@ -35,7 +36,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from gasil_jax.agents.adversarial import BONUSES, PPOGASIL
-from gasil_jax.agents.novelty import PPONovelty, Visits
+from gasil_jax.agents.novelty import TIE, PPONovelty, Visits
 from gasil_jax.buffer import GoodTrajectories, mean_return
 from gasil_jax.config import choice
 from gasil_jax.context import Context, Metrics, Sizes
@@ -45,9 +46,8 @@ from gasil_jax.rollout import Rollout
 # What a batch's episodes still weigh in the moments after the next batch: in those of
 # the latest batches, and in those of more.
 _LATEST, _MORE = 0.9, 0.98
-# How fast exploration fades with the rise of returns, which is below 1 even for returns
-# that only rise.
-_FADING = 2.0
+# Added to the gain that q is a share of, so that q is below 0.1 for novelty alone.
+_GAIN = 0.01
 # Returns that differ by less than this share of their size are equal: float32 sums of
 # equal returns differ by less.
 _EQUAL = 1e-3
@@ -67,6 +67,7 @@ class ImitatingExplorer(struct.PyTreeNode):
     visits: Visits
     discriminator: Learner
     buffer: GoodTrajectories
+    novelty: jax.Array  # float32 (env,), sum over the running episode
     returns: Returns
 
 
@@ -98,30 +99,36 @@ def moments(sums: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 def progress(returns: Returns) -> jax.Array:
-    """Return the rise of the returns in standard deviations, (m - M) / S, ()."""
+    """Return p, how fast the returns rise, from 0 to 1, ()."""
     mean, deviation = moments(returns.more)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-8
-    return (moments(returns.latest)[0] - mean) / (deviation + resolution)
+    resolution = _EQUAL * jnp.abs(mean) + 1e-12
+    rise = moments(returns.latest)[0] - mean
+    # A steady rise of all returns gives a ratio of 0.8.
+    return jnp.clip(2.0 * rise / (deviation + resolution), 0.0, 1.0)
 
 
 def better(buffer: GoodTrajectories, returns: Returns) -> GoodTrajectories:
     """Return the buffer without episodes that are no better than the policy's mean."""
     mean, _ = moments(returns.latest)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-8
+    resolution = _EQUAL * jnp.abs(mean) + 1e-12
     # They come first, because the buffer is sorted by return.
     is_better = buffer.filled & (buffer.return_ > mean + resolution)
     return buffer.replace(size=jnp.sum(is_better & (returns.latest[0] > 0)))
 
 
-def lack(good: GoodTrajectories, returns: Returns) -> jax.Array:
-    """Return the share of the gain that the policy lacks, from 0 to 1, ().
+def lack(
+    good: GoodTrajectories, returns: Returns, unit: jax.Array | float
+) -> jax.Array:
+    """Return q, the share of the gain that the policy lacks, from 0 to 1, ().
 
     Args:
       good: the buffer's better episodes, from `better`.
       returns: the policy's returns.
+      unit: the number that rewards were divided by, (): the unit of the 0.01.
     """
     mean, _ = moments(returns.latest)
-    share = (mean_return(good) - mean) / (good.return_[0] - returns.lowest + 1e-8)
+    gained = good.return_[0] - returns.lowest + _GAIN * unit
+    share = (mean_return(good) - mean) / gained
     return jnp.where(good.size > 0, jnp.clip(share, 0.0, 1.0), 0.0)
 
 
@@ -141,14 +148,19 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
             visits=self.init_visits(key, sizes),
             discriminator=self.init_discriminator(discriminator_key, sizes),
             buffer=self.init_buffer(sizes),
+            novelty=jnp.zeros(sizes.num_envs),
             returns=no_returns(),
         )
 
     def remember(self, state: Any, context: Context) -> Any:
-        batch = context.rollout
+        batch, visits = context.rollout, self.count(state.visits, context)
+        novelty, total = self.follow_novelty(state.novelty, visits, context)
+        tie = TIE * context.reward_scale * total / batch.episode_length
+        rank = batch.discounted_return + tie
         return state.replace(
-            visits=self.count(state.visits, context),
-            buffer=self.insert(state.buffer, context, batch.discounted_return),
+            visits=visits,
+            buffer=self.insert(state.buffer, context, rank),
+            novelty=novelty,
             returns=follow(state.returns, batch),
         )
 
@@ -156,10 +168,10 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
         self, state: Any, context: Context, key: jax.Array
     ) -> tuple[Any, jax.Array, Metrics]:
         good = better(state.buffer, state.returns)
-        lacked, risen = lack(good, state.returns), progress(state.returns)
-        exploring = 1.0 - jnp.clip(_FADING * risen, 0.0, 1.0)
+        exploring = 1.0 - progress(state.returns)
+        imitating = exploring * lack(good, state.returns, context.reward_scale)
         faded = self.replace(
-            alpha=self.alpha * lacked,
+            alpha=self.alpha * imitating,
             novelty_coefficient=self.novelty_coefficient * exploring,
         )
         imitated, reward, metrics = PPOGASIL.update_and_reward(
@@ -167,6 +179,6 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
         )
         context = context.replace(rollout=context.rollout.replace(reward=reward))
         _, reward, own = PPONovelty.update_and_reward(faded, state, context, key)
-        own |= {"imitation_weight": lacked, "novelty_weight": exploring}
+        own |= {"imitation_weight": imitating, "novelty_weight": exploring}
         own |= self.buffer_metrics(state.buffer)
         return imitated.replace(buffer=state.buffer), reward, metrics | own

@@ -32,9 +32,9 @@ from gasil_jax.context import Context, Metrics, Sizes
 # each with a prime that the hash multiplies by.
 _COUNTERS, _DIRECTIONS = 2**14, 4
 _PRIMES = (73856093, 19349663, 83492791, 49979687)
-# Weight of an episode's mean novelty, from 0 to 1, in its rank. It decides only between
-# episodes whose returns differ by less than this.
-_TIE = 1e-3
+#: Weight of an episode's mean novelty, from 0 to 1, in its rank. It decides only
+#: between episodes whose returns differ by less than this.
+TIE = 1e-3
 
 
 class Visits(struct.PyTreeNode):
@@ -102,6 +102,28 @@ class PPONovelty(Agent):
         mixed = jnp.sum(cell * primes, axis=-1)
         return (mixed ^ (mixed >> 15)) & (_COUNTERS - 1)
 
+    def follow_novelty(
+        self, total: jax.Array, visits: Visits, context: Context
+    ) -> tuple[jax.Array, jax.Array]:
+        """Return the sums of the running episodes' novelty after and in a batch.
+
+        Args:
+          total: float32 (env,), the sums before the batch.
+          visits: the counters with the batch's visits.
+          context: the iteration's data.
+
+        Returns:
+          The sums after the batch, (env,); and up to each of its steps, (time, env).
+        """
+
+        def add(total: jax.Array, step: Any) -> Any:
+            novelty, ended = step
+            total += novelty
+            return jnp.where(ended, 0.0, total), total
+
+        steps = self.novelty(visits, context), context.rollout.ended
+        return jax.lax.scan(add, total, steps)
+
     def remember(self, state: Any, context: Context) -> Any:
         return state.replace(visits=self.count(state.visits, context))
 
@@ -128,14 +150,6 @@ class PPOBCNovelty(PPONovelty, PPOBC):
 
     def remember(self, state: Explorer, context: Context) -> Explorer:
         batch, visits = context.rollout, self.count(state.visits, context)
-
-        def add(total: jax.Array, step: Any) -> Any:
-            novelty, ended = step
-            total += novelty
-            return jnp.where(ended, 0.0, total), total
-
-        steps = self.novelty(visits, context), batch.ended
-        novelty, total = jax.lax.scan(add, state.novelty, steps)
-        return_ = batch.discounted_return + _TIE * total / batch.episode_length
-        buffer = self.insert(state.buffer, context, return_)
-        return Explorer(visits, buffer, novelty)
+        novelty, total = self.follow_novelty(state.novelty, visits, context)
+        return_ = batch.discounted_return + TIE * total / batch.episode_length
+        return Explorer(visits, self.insert(state.buffer, context, return_), novelty)

@@ -179,7 +179,7 @@ NUMBERS = """
 --grid my_weight=0.1,2 | my_weight is 2.0: it must be 0 or more
 --grid my_wieght=0.1 | did you mean 'my_weight'?
 --agent ppo --grid my_weight=0.1 | 'my_weight' can't vary
---grid alpha=0.1 | alpha is a setting of gasil, ppo+gasil, gail
+--grid alpha=0.1 | alpha is a setting of gasil, ppo+gasil, ppo+gasil+novelty
 """
 
 
