@@ -131,6 +131,7 @@ class Results:
         self.curves: dict[tuple[str, str], CurveResults] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
         self.sooner: dict[tuple[str, str], np.ndarray] = {}
+        self._forests: dict[str, list[Row]] = {}
         for panel, label, curve in figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
@@ -235,6 +236,12 @@ class Results:
         seeds that solve a task. These rows are a family of tests. Panels where both
         curves return less than doing nothing do not count.
         """
+        # A page draws them, lists them and names single ones.
+        if kind not in self._forests:
+            self._forests[kind] = self._forest(kind)
+        return self._forests[kind]
+
+    def _forest(self, kind: str) -> list[Row]:
         if self.is_of_one_task:
             return [
                 Row(row_name(*key), one, {}) for key, one in self.comparisons.items()

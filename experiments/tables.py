@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from experiments import doing_nothing
-from experiments.comparisons import BELOW, in_words, number
+from experiments.comparisons import BELOW, Comparison, in_words, number
 from experiments.curves import Curve, name_of
 from experiments.figure_results import Results, Row, row_name
 from experiments.search import AGENTS, BEYOND, DELAY, SPACES, TASKS
@@ -153,9 +153,14 @@ def _compared(rows: Sequence[Row], results: Results, *, sooner: bool = False) ->
     lines = []
     for row in rows:
         one = row.compared
-        words = in_words(null + one.middle, null + one.low, null + one.high, spec)
-        lines.append([row.name, words, number(one.visible, spec), one.verdict])
+        words = [_beside(null, one, spec), number(one.visible, spec), one.verdict]
+        lines.append([row.name, *words])
     return markdown_table(["", what, "visible from", "verdict"], lines)
+
+
+def _beside(null: float, one: Comparison, spec: str) -> str:
+    """Return an effect, measured from its null, and its interval as text."""
+    return in_words(null + one.middle, null + one.low, null + one.high, spec)
 
 
 def _find(results: Results, panel: str, name: str) -> Curve:
@@ -206,8 +211,7 @@ def likely(results: Results, ours: str, other: str) -> str:
     compared = {row.name: row.compared for row in results.forest()}
     if (one := compared.get(row_name("", ours, other))) is None:
         return ""
-    words = in_words(0.5 + one.middle, 0.5 + one.low, 0.5 + one.high, ".2f")
-    return f"{words}, {one.verdict}"
+    return f"{_beside(0.5, one, '.2f')}, {one.verdict}"
 
 
 def below(results: Results, kind: str = "") -> str:

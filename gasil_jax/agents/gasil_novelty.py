@@ -92,27 +92,30 @@ def follow(returns: Returns, batch: Rollout) -> Returns:
 
 def moments(sums: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Return the mean and the standard deviation of sums, (3,); 0 without episodes."""
-    _, total, squares = sums
-    count = jnp.maximum(sums[0], 1e-8)
+    count, total, squares = sums
+    count = jnp.maximum(count, 1e-8)
     mean = total / count
     return mean, jnp.sqrt(jnp.maximum(squares / count - mean**2, 0.0))
+
+
+def resolution(mean: jax.Array) -> jax.Array:
+    """Return the difference up to which returns around a mean are equal, ()."""
+    return _EQUAL * jnp.abs(mean) + 1e-12
 
 
 def progress(returns: Returns) -> jax.Array:
     """Return p, how fast the returns rise, from 0 to 1, ()."""
     mean, deviation = moments(returns.more)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-12
     rise = moments(returns.latest)[0] - mean
     # A steady rise of all returns gives a ratio of 0.8.
-    return jnp.clip(2.0 * rise / (deviation + resolution), 0.0, 1.0)
+    return jnp.clip(2.0 * rise / (deviation + resolution(mean)), 0.0, 1.0)
 
 
 def better(buffer: GoodTrajectories, returns: Returns) -> GoodTrajectories:
     """Return the buffer without episodes that are no better than the policy's mean."""
     mean, _ = moments(returns.latest)
-    resolution = _EQUAL * jnp.abs(mean) + 1e-12
     # They come first, because the buffer is sorted by return.
-    is_better = buffer.filled & (buffer.return_ > mean + resolution)
+    is_better = buffer.filled & (buffer.return_ > mean + resolution(mean))
     return buffer.replace(size=jnp.sum(is_better & (returns.latest[0] > 0)))
 
 

@@ -260,9 +260,7 @@ def drive(
     def evaluate() -> _Columns | None:
         nonlocal score
         score = None
-        if evaluation is None:
-            return None
-        if training.left and not evaluation.interval.ends(training.done):
+        if evaluation is None or not evaluation.interval.is_due(training.done):
             return None
         first = "" if evaluation.seconds else "compiling and "
         with progress.aside(f"{first}evaluating the policies"):
@@ -320,9 +318,7 @@ def drive(
         scores = evaluate()
         if checkpoints.is_due(training.done, score):
             save()
-        if videos is not None and (
-            not training.left or videos.interval.ends(training.done)
-        ):
+        if videos is not None and videos.interval.is_due(training.done):
             videos.film(training.states, training.done, progress)
         if callback is not None:
             stopped = bool(callback(training.progress(metrics, scores)))

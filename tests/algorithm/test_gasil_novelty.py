@@ -6,23 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_novelty import ENV, KEY, first_context
 
 import gasil_jax
 from gasil_jax.agents import gasil_novelty
-from gasil_jax.agents.behavior_cloning import PPOBC
 from gasil_jax.agents.gasil_novelty import PPOGASILNovelty
 from gasil_jax.buffer import init_buffer
-from gasil_jax.testing import example_context
-
-ENV = gasil_jax.make_env("sparse:u_maze", max_episode_steps=8)
-CONFIG = gasil_jax.Config(batch_steps=128, num_envs=4, minibatch_size=64)
-KEY = jax.random.key(0)
-
-
-@functools.cache
-def first_context():
-    algorithm = gasil_jax.Algorithm(PPOBC(), config=CONFIG)
-    return jax.jit(lambda key: example_context(ENV, algorithm, key))(KEY)
 
 
 def batch_of(returns, completed):
