@@ -29,6 +29,8 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
     _flags += " --xla_cpu_parallel_codegen_split_count=1"
     os.environ["XLA_FLAGS"] = _flags.strip()
 
+# Where each operation was written is in no result; to note it takes a twentieth.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # What JAX traces and compiles stays alive: to look through all of it as often as Python
 # does by default takes a twentieth of the time.
 gc.set_threshold(100_000, 20, 20)
@@ -54,6 +56,11 @@ def pytest_collectstart():
     from gasil_envs.physics import host_threads
 
     host_threads.reserve(2)
+
+
+def pytest_collection_finish():
+    """Look no more through what has been imported."""
+    gc.freeze()
 
 
 def _is_optimized(item):

@@ -172,7 +172,6 @@ def test_cloning_makes_the_good_steps_likelier():
         params = gasil_jax.member(states, i).actor_critic.policy.params
         gaussian = network.apply(params, observation)
         losses.append(-float(jnp.mean(GAUSSIAN.log_prob(gaussian, good.action[:100]))))
-    print("losses:", losses)
     assert losses[0] < losses[1] - 0.01
     # Without weight it is PPO. Adam's momentum still acts on the policy, so that only
     # the value, which cloning leaves alone, is equal.

@@ -1,19 +1,14 @@
-"""Policies that are mixtures of Gaussians: their formulas, files, and refusals."""
-
-import functools
+"""Policies that are mixtures of Gaussians; saved ones: test_policy.py."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_training import SETTINGS, drawn_policies
+from small_training import SETTINGS
 from test_distributions import softmax
 
 import gasil_jax
-from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.distributions import GAUSSIAN, MIXTURE
-from gasil_jax.host import policy_file
-from gasil_jax.networks import MixturePolicy
 
 
 def draw(seed=0, batch=5, components=4, size=3, spread=1.0):
@@ -106,57 +101,6 @@ def test_replays_train_it():
     assert (metrics["skipped_updates"] == 0).all()
     layers = state.actor_critic.policy.params["params"]["MLP_0"]
     assert layers["Dense_1"]["bias"].shape == (3 * (2 + 1),)
-
-
-@functools.cache
-def random_policies():
-    """Return the environment and the states of two policies with random layers."""
-    env = gasil_jax.make_env("point_mass")
-    algorithm = gasil_jax.algorithm("ppo", **SETTINGS, policy_components=3)
-    return env, drawn_policies(env, algorithm, 2)
-
-
-def save(path):
-    """Save these policies, and return what they are of."""
-    env, states = random_policies()
-    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
-    return env, states
-
-
-def test_a_saved_policy_acts_as_the_network(tmp_path):
-    env, states = save(tmp_path / "policy.npz")
-    params, normalizer = jax.tree.map(
-        lambda x: x[1], (states.actor_critic.policy.params, states.normalizer)
-    )
-    observation = 3 * jax.random.normal(jax.random.key(0), (9, env.observation_size))
-    network = MixturePolicy(SETTINGS["hidden_sizes"], 2, components=3)
-    normalized = normalization.normalize(normalizer, observation)
-    parameters = jax.jit(network.apply)(params, normalized)
-    mean, log_std, logits = (np.asarray(x, float) for x in parameters)
-    chosen = logits.argmax(axis=1)
-    assert len(set(chosen.tolist())) > 1  # Or the order of the output is not tested.
-    expected = np.clip(mean[np.arange(9), chosen], -1.0, 1.0)
-    act, in_numpy = gasil_jax.load_policy(tmp_path), numpy_policy.load(tmp_path)
-    for action in (act(observation), jax.jit(jax.vmap(act))(observation)):
-        np.testing.assert_allclose(action, expected, atol=1e-5)
-    drawn = in_numpy(np.asarray(observation))
-    assert drawn.dtype == np.float32
-    np.testing.assert_allclose(drawn, expected, atol=1e-5)
-    np.testing.assert_allclose(in_numpy(np.asarray(observation[3])), expected[3], 1e-4)
-
-    # Both draw from the same mixture, here without the clip.
-    weights = numpy_policy.read(tmp_path, 4)
-    weights |= {"low": np.full(2, -99.0), "high": np.full(2, 99.0)}
-    many = np.tile(observation[0], (20_000, 1))
-    w = softmax(logits[0])[:, None]
-    center = np.sum(w * mean[0], axis=0)
-    variance = np.sum(w * (mean[0] - center) ** 2, axis=0) + np.exp(2 * log_std)
-    for drawn in (
-        numpy_policy.make(weights)(many, np.random.default_rng(0)),
-        policy.make(weights)(many, jax.random.key(0)),
-    ):
-        np.testing.assert_allclose(drawn.mean(axis=0), center, atol=0.03)
-        np.testing.assert_allclose(drawn.std(axis=0), np.sqrt(variance), rtol=0.03)
 
 
 def test_a_component_is_drawn_by_its_weight():

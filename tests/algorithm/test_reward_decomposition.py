@@ -232,7 +232,6 @@ def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
     returns = jax.jit(jax.vmap(train))(keys)[1]["episode_return"]
-    print("returns:", returns[:, -5:].mean(axis=1))
     # Without the model they are 20.0 and 16.6.
     assert (returns[:, -5:].mean(axis=1) > 22.5).all()
 

@@ -164,21 +164,15 @@ def test_a_forked_process_is_refused(make):
 
 
 @SINGLE_AND_BATCH
-def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
+def test_a_wrong_use_is_told_and_info_has_the_same_entries_after_reset_and_step(make):
     env = make()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
+        env.step(env.action_space.sample())
     _, first = env.reset(seed=0)
     *_, then = env.step(env.action_space.sample())
     describe = lambda info: {key: (type(x), np.shape(x)) for key, x in info.items()}
     assert describe(first) == describe(then)
     assert not np.any(first["true_reward"])
-
-
-@SINGLE_AND_BATCH
-def test_a_wrong_use_is_told(make):
-    env = make()
-    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
-        env.step(env.action_space.sample())
-    env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action has shape \(5, 2\): it must have \("):
         env.step(np.zeros((5, 2)))
 

@@ -2,9 +2,8 @@
 
 import errno
 import os
+import resource
 import shutil
-import subprocess
-import sys
 from unittest import mock
 
 import jax
@@ -157,25 +156,19 @@ def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
     assert names(tmp_path) == ["00000002"]
 
 
-def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path):
+def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path, capfd):
     """Each of Orbax's and TensorStore's threads has a traceback of its own."""
-    program = """
-import pathlib, resource, sys
-import numpy as np
-from gasil_jax.host import checkpoint, saved
-
-# No file may grow beyond this: writing fails as on a full disk.
-resource.setrlimit(resource.RLIMIT_FSIZE, (2000, 2000))
-state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
-try:
-    checkpoint.write(pathlib.Path(sys.argv[1]), 1, state, {})
-except checkpoint.WriteError as error:
-    print(error, file=sys.stderr)
-"""
-    arguments = [sys.executable, "-c", program, str(tmp_path)]
-    ended = subprocess.run(arguments, capture_output=True, text=True)
-    assert ended.stderr == f"{tmp_path} can't be written: File too large\n"
-    assert names(tmp_path) == []
+    state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    # No file may grow beyond this: writing fails as on a full disk.
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2000, hard))
+    try:
+        with pytest.raises(checkpoint.WriteError) as told:
+            write(tmp_path, 1, state=state)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(told.value) == f"{tmp_path} can't be written: File too large"
+    assert "".join(capfd.readouterr()) == "" and names(tmp_path) == []
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
