@@ -585,6 +585,9 @@ _ONE_DELAYED = [
     *_ONE_ARMS,
     Arm("without decomposition", _ONE, {"decompose_rewards": False}),
 ]
+#: Beside them, of other figures: agents with what a search chose on the task or, where
+#: rewards are sparse, on all sparse tasks.
+_TUNED = [Arm(f"{agent} (tuned)", agent) for agent in PAIR]
 _GYMNAX = [
     f"gymnax:{name}"
     for name in (
@@ -593,27 +596,24 @@ _GYMNAX = [
     )
 ]
 _DOOR_KEYS = [f"navix:Navix-DoorKey-{size}-v0" for size in ("5x5", "6x6", "8x8")]
+#: No search and no other figure has these seeds.
+_on_own_seeds = functools.partial(grid, seeds=20, first_seed=100)
 
 
 def _one_agent(
     tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
 ) -> Panels:
-    """Return the one agent and what it is compared with, all with the rule `scaled`.
-
-    No search and no other figure has its seeds.
-    """
+    """Return the one agent and what it is compared with, all with the rule `scaled`."""
     # Other tasks than robots have two dimensions, fewer, or discrete actions.
     sizes = presets.ACTION_SIZES
     robots = {env: env.removeprefix("sparse:").removesuffix("_noisy") for env in tasks}
     return joined(
-        grid(
+        _on_own_seeds(
             (env,),
             _ONE_DELAYED if delay > 1 else _ONE_ARMS,
             (delay,),
             base=None,
             changes=presets.scaled(sizes.get(robot, 2), decompose_rewards=delay > 1),
-            seeds=20,
-            first_seed=100,
             total_steps=total_steps,
         )
         for env, robot in robots.items()
@@ -902,6 +902,13 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent(TASKS, (1, DELAY, 100)),
                 _one_agent(["point_mass", *_GYMNAX]),
+                *(
+                    grid(
+                        (env,), _TUNED, (delay,), base=Search, seeds=_seeds(env, delay)
+                    )
+                    for env, delay in CELLS
+                ),
+                _on_own_seeds(_GYMNAX, [Arm("ppo (gymnax)", "ppo")], base="gymnax"),
             ]
         ),
         favourite=_ONE,
@@ -914,6 +921,13 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent([*SPARSE, *_NOISY], total_steps=SPARSE_STEPS),
                 _one_agent([*_ROBOTS, *_DOOR_KEYS]),
+                *(
+                    grid(own, _TUNED, base=SparseSearch, seeds=20, total_steps=steps)
+                    for own, steps in (
+                        ([*SPARSE, *_NOISY], SPARSE_STEPS),
+                        ([*_ROBOTS, *SPARSE_GRIDS], STEPS),
+                    )
+                ),
             ]
         ),
         favourite=_ONE,
