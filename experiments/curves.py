@@ -199,25 +199,19 @@ class Figure:
         value = {**vars(curve), **curve.changes}[self.over[0]]
         return name.replace(f"-{value}", "", 1), value
 
-    def rival(self, panel: str, name: str) -> str | None:
-        """Return the favourite's curve at the x value of a curve, or None."""
-        point = (self.favourite, self.point_of(panel, name)[1])
-        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == point)
-        return next((x for x in curves if x != name), None)
-
     def compared(self) -> Comparisons:
         """Return all comparisons of the figure."""
         if self.comparisons is not None:
             return self.comparisons
         compared: dict[tuple[str, ...], Terms] = {}
         for panel, curves in self.panels.items():
-            pairs = [(self.rival(panel, name), name) for name in curves]
-            if self.pairs:
-                pairs = [pair for pair in self.pairs if curves.keys() >= {*pair}]
+            pairs = self.pairs or [
+                (self.favourite, name) for name in curves if name != self.favourite
+            ]
             for part in ("", " early") if self.early else ("",):
-                for ours, other in pairs:
-                    if ours is not None:
-                        names = f"{ours}{part}", f"{other}{part}"
+                for pair in pairs:
+                    if curves.keys() >= {*pair}:
+                        names = [f"{name}{part}" for name in pair]
                         compared[panel, *names] = difference(panel, *names)
         return compared
 

@@ -20,7 +20,6 @@ from experiments.agents import OWN
 from experiments.claims import Pages
 from experiments.figure_results import Results, families
 from experiments.figures import FIGURES
-from experiments.options import Options, Parser
 from experiments.search import ADAPTIVE, PAIR, PaperSearch, SparseSearch
 from experiments.store import RESULTS, Store
 from gasil_jax import presets
@@ -191,10 +190,9 @@ def tuned(pages: Pages) -> str:
     return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options, of which there are none."""
-    about = "Write all pages, plots and presets, and the README's text on results."
-    return Parser("report", about)
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Write all pages, plots and presets, and the README's text on results."""
 
 
 def run(options: Options) -> None:

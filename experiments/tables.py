@@ -84,24 +84,24 @@ def claim(results: Results) -> str:
 
 def curves(results: Results, kind: str = "") -> str:
     """Return the picture of learning curves, or of final returns over a setting."""
-    return _shown("curves", results, kind, "returns of each agent on each task")
+    if not is_drawn(results, "curves"):
+        return "Not trained yet."
+    words = "returns of each agent on each task"
+    return f"![{words}]({picture(results.name, 'curves', kind)})"
 
 
 def forest(results: Results, kind: str = "") -> str:
     """Return the picture of what is compared, with the numbers folded."""
+    if not is_drawn(results, "forest", kind):
+        return numbers(results, kind)
     words = "differences with their intervals, and the verdict on each task"
-    return f"{_shown('forest', results, kind, words)}\n\n{numbers(results, kind)}"
+    drawn = f"![{words}]({picture(results.name, 'forest', kind)})"
+    return f"{drawn}\n\n{numbers(results, kind)}"
 
 
 def is_drawn(results: Results, slot: str, kind: str = "") -> bool:
     """Return whether there are runs for a picture."""
     return bool(results.forest(kind) if slot == "forest" else results.curves)
-
-
-def _shown(slot: str, results: Results, kind: str, words: str) -> str:
-    if not is_drawn(results, slot, kind):
-        return "Not trained yet."
-    return f"![{words}]({picture(results.name, slot, kind)})"
 
 
 def numbers(results: Results, kind: str = "") -> str:
