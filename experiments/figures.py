@@ -598,7 +598,7 @@ _DOOR_KEYS = [f"navix:Navix-DoorKey-{size}-v0" for size in ("5x5", "6x6", "8x8")
 def _one_agent(
     tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
 ) -> Panels:
-    """Return the one agent and what it is compared with, all with the rule `scaled`.
+    """Return the one agent and what it is compared with, all with its rule.
 
     No search and no other figure has its seeds.
     """
@@ -611,7 +611,7 @@ def _one_agent(
             _ONE_DELAYED if delay > 1 else _ONE_ARMS,
             (delay,),
             base=None,
-            changes=presets.scaled(sizes.get(robot, 2), decompose_rewards=delay > 1),
+            changes=presets.scaled_with_entropy(sizes.get(robot, 2), delay > 1),
             seeds=20,
             first_seed=100,
             total_steps=total_steps,
