@@ -159,26 +159,35 @@ class Figure:
         return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
 
     def of_kind(self, kind: str = "") -> list[str]:
-        """Return the panels of a kind.
+        """Return the panels of a kind, or the one panel of this name.
 
-        It is "delayed" or "dense", with "raw" behind it for rewards that are not
-        normalized; of sparse tasks "robots" or "navix", and "noisy" for noise on the
-        actions. Without a kind they are all panels, or the sparse ones of no such
+        A kind is "dense" or "delayed" for locomotion, with "100" behind it for a delay
+        that is longer than the usual one and "raw" for rewards that are not normalized,
+        or "others". Of sparse tasks it is "robots" or "navix", and "noisy" for noise on
+        the actions. Without a kind they are all panels, or the sparse ones of no such
         kind.
         """
 
         def words(panel: str) -> set[str]:
-            if self.solved_from is None:
-                delayed, raw, _ = next(iter(self.panels[panel].values())).family
-                return {"delayed" if delayed else "dense", *["raw"] * raw}
+            curve = next(iter(self.panels[panel].values()))
+            delayed, raw, _ = curve.family
             task = panel.removesuffix("_noisy")
+            other = task.startswith(("gymnax:", "point_mass"))
+            dense = self.solved_from is None and not other
             kinds = {
+                "dense": dense and not delayed,
+                "delayed": delayed,
+                f"{curve.reward_delay}": curve.reward_delay > DELAY,
+                "raw": raw,
+                "others": other,
                 "robots": task in SPARSE_ROBOTS,
                 "navix": task.startswith("navix:"),
+                "noisy": task != panel,
             }
-            kinds["noisy"] = task != panel
             return {x for x, holds in kinds.items() if holds}
 
+        if kind in self.panels:
+            return [kind]
         of_all = not kind and self.solved_from is None
         return [x for x in self.panels if of_all or words(x) == set(kind.split())]
 

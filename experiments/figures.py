@@ -574,17 +574,18 @@ def _with_exploration(env: str) -> Panels:
 #: One agent with one rule for all tasks, the agent without each of its parts, and PPO
 #: and PPO+NOVELTY with the same rule.
 _ONE = "ppo+gasil+novelty"
-_ONE_ARMS = [
+_ONE_DELAYED = [
     Arm(_ONE, _ONE),
     Arm("without imitation", _ONE, {"alpha": 0.0}),
     Arm("without novelty", _ONE, {"novelty_coefficient": 0.0}),
+    Arm("without decomposition", _ONE, {"decompose_rewards": False}),
     Arm("ppo", "ppo"),
     Arm("ppo+novelty", "ppo+novelty"),
 ]
-_ONE_DELAYED = [
-    *_ONE_ARMS,
-    Arm("without decomposition", _ONE, {"decompose_rewards": False}),
-]
+_ONE_ARMS = [x for x in _ONE_DELAYED if x.name != "without decomposition"]
+#: Beside them, of other figures: agents with what a search chose on the task or, where
+#: rewards are sparse, on all sparse tasks.
+_TUNED = [Arm(f"{agent} (tuned)", agent) for agent in PAIR]
 _GYMNAX = [
     f"gymnax:{name}"
     for name in (
@@ -593,27 +594,24 @@ _GYMNAX = [
     )
 ]
 _DOOR_KEYS = [f"navix:Navix-DoorKey-{size}-v0" for size in ("5x5", "6x6", "8x8")]
+#: No search and no other figure has these seeds.
+_on_own_seeds = functools.partial(grid, seeds=20, first_seed=100)
 
 
 def _one_agent(
     tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
 ) -> Panels:
-    """Return the one agent and what it is compared with, all with its rule.
-
-    No search and no other figure has its seeds.
-    """
+    """Return the one agent and what it is compared with, all with its rule."""
     # Other tasks than robots have two dimensions, fewer, or discrete actions.
     sizes = presets.ACTION_SIZES
     robots = {env: env.removeprefix("sparse:").removesuffix("_noisy") for env in tasks}
     return joined(
-        grid(
+        _on_own_seeds(
             (env,),
             _ONE_DELAYED if delay > 1 else _ONE_ARMS,
             (delay,),
             base=None,
             changes=presets.scaled_with_entropy(sizes.get(robot, 2), delay > 1),
-            seeds=20,
-            first_seed=100,
             total_steps=total_steps,
         )
         for env, robot in robots.items()
@@ -902,10 +900,17 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent(TASKS, (1, DELAY, 100)),
                 _one_agent(["point_mass", *_GYMNAX]),
+                *(
+                    grid(
+                        (env,), _TUNED, (delay,), base=Search, seeds=_seeds(env, delay)
+                    )
+                    for env, delay in CELLS
+                ),
+                _on_own_seeds(_GYMNAX, [Arm("ppo (gymnax)", "ppo")], base="gymnax"),
             ]
         ),
         favourite=_ONE,
-        shown=[arm.name for arm in _ONE_ARMS],
+        shown=[arm.name for arm in _ONE_DELAYED],
     ),
     "one_agent_sparse": Figure(
         "One agent with one rule for all tasks: sparse rewards",
@@ -914,10 +919,17 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent([*SPARSE, *_NOISY], total_steps=SPARSE_STEPS),
                 _one_agent([*_ROBOTS, *_DOOR_KEYS]),
+                *(
+                    grid(own, _TUNED, base=SparseSearch, seeds=20, total_steps=steps)
+                    for own, steps in (
+                        ([*SPARSE, *_NOISY], SPARSE_STEPS),
+                        ([*_ROBOTS, *SPARSE_GRIDS], STEPS),
+                    )
+                ),
             ]
         ),
         favourite=_ONE,
-        shown=[arm.name for arm in _ONE_ARMS],
+        shown=[arm.name for arm in _ONE_DELAYED],
         solved_from=solved_from,
     ),
 }
