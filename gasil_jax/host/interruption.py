@@ -1,39 +1,11 @@
 """Record SIGINT and SIGTERM, so that training can save before it stops."""
 
 import contextlib
-import os
 import signal
 import sys
 from collections.abc import Iterator
 from types import FrameType
 from typing import Any
-
-
-def runs_as_program(package: str) -> bool:
-    """Whether Python is about to run a module of the package as a program.
-
-    It imports the package before it. While it looks for the module that -m names, the
-    first argument is "-m".
-    """
-    ours = any(x.removeprefix("-m").split(".")[0] == package for x in sys.orig_argv)
-    return ours and sys.argv[:1] == ["-m"]
-
-
-def quit_during_imports() -> None:
-    """Let Ctrl-C end this process in a line until `allow_interrupts` is called."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _quit)
-
-
-def _quit(number: int, frame: FrameType | None) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(128 + number)
-
-
-def allow_interrupts() -> None:
-    """Let Ctrl-C raise `KeyboardInterrupt` again, after `quit_during_imports`."""
-    if signal.getsignal(signal.SIGINT) is _quit:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Interrupted(Exception):
