@@ -390,9 +390,9 @@ def _check(options: Options, requested: Sweep) -> None:
     check_minimum(requested.recording, **dict.fromkeys(counts, 1))
     check_minimum(requested.settings, max_episode_steps=1)
     if options.out is not None:
+        folders.check_writable(options.out)
         if not options.resume and getattr(options, "shard", None) is None:
             folders.refuse_used(options.out)
-        folders.check_writable(options.out)
 
 
 def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
