@@ -65,12 +65,6 @@ def _failures(
     cpus = 1 if on_gpu else devices or 1
     # By default a job would use every core of its node.
     more = [] if on_gpu or devices else ["--devices", "1"]
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    if not any(node.get("CPU", 0) >= cpus for node in nodes):
-        raise InputError(
-            f"launcher is 'ray': no node of the cluster has {cpus} CPUs, which each "
-            "job reserves"
-        )
     # JAX sets up its devices once per process, so each job needs its own. The process
     # ends with the job, so that the folder is free when the job runs again.
     task = ray.remote(
