@@ -7,10 +7,9 @@ alone, not from the members beside it or from the device it runs on.
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +23,6 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, Range
 from gasil_jax.errors import refusal
 from gasil_jax.host import resources
-
-T = TypeVar("T")
 
 
 def member(states: Any, index: int) -> Any:
@@ -45,20 +42,6 @@ def member(states: Any, index: int) -> Any:
     if not traced and not -count <= index < count:
         raise IndexError(f"index is {index}: there are {count} states")
     return jax.tree.map(lambda x: x[index], states)
-
-
-def _in_thread(function: Callable[[], T]) -> futures.Future[T]:
-    """Call a function in a thread, so that this one can answer to signals."""
-    future: futures.Future[T] = futures.Future()
-
-    def call() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=call).start()
-    return future
 
 
 def advance_members(
@@ -199,14 +182,16 @@ class Members:
         arguments = shapes, np.int32(0), self.data
         traced = self.advance.trace(*arguments)
         resources.check_arrays(traced.jaxpr.jaxpr, self.algorithm, self.devices)
-        compiled = _in_thread(lambda: traced.lower().compile())
-        # The first states have a program of their own, which takes seconds too.
-        first = _in_thread(
-            lambda: jax.block_until_ready(
-                self.init() if states is None else self.to_devices(states)
-            )
-        )
-        return first.result(), compiled.result()
+
+        def first() -> Any:
+            moved = self.init() if states is None else self.to_devices(states)
+            return jax.block_until_ready(moved)
+
+        # In threads, so that this one can answer to signals. The first states have a
+        # program of their own, which takes seconds too.
+        pool = futures.ThreadPoolExecutor()
+        compiled = pool.submit(lambda: traced.lower().compile())
+        return pool.submit(first).result(), compiled.result()
 
     def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function of one member for all, (padded, ...), sharded likewise."""
