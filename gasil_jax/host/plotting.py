@@ -47,13 +47,6 @@ def binned_returns(
     return steps, np.stack(means, axis=1)
 
 
-def smoothed(returns: np.ndarray, window: int) -> np.ndarray:
-    """Return the means over each point and those before it, `window` in all."""
-    sums = np.cumsum(returns, axis=-1)
-    sums[..., window:] -= sums[..., :-window].copy()
-    return sums / np.minimum(np.arange(1, returns.shape[-1] + 1), window)
-
-
 def unit_of_steps(most: float) -> tuple[float, str]:
     """Return the unit in which steps up to `most` are drawn, and its name."""
     if most >= 500_000:

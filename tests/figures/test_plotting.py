@@ -124,12 +124,6 @@ def test_a_sweep_is_sorted_and_the_best_points_have_curves(figures, tmp_path):
     assert curves.get_xlabel() == "steps" and figure.get_suptitle() == "hopper, ppo"
 
 
-def test_a_moving_mean_is_of_the_points_before():
-    smoothed = plotting.smoothed(np.array([[1.0, 3.0, 5.0, 7.0]]), 2)
-    np.testing.assert_allclose(smoothed, [[1.0, 2.0, 4.0, 6.0]])
-    np.testing.assert_allclose(plotting.smoothed(smoothed, 1), smoothed)
-
-
 def test_a_picture_of_many_points_is_not_too_large(monkeypatch, tmp_path):
     kept = []
     pixels = lambda self, *_, dpi: kept.append(dpi * self.get_size_inches().max())
