@@ -1,12 +1,10 @@
-"""Read or draw the points of a sweep.
+"""Make or draw the points of a sweep.
 
 A point holds changed settings, by name; of a sweep over agents its "agent", too.
 """
 
 import itertools
-import json
 import math
-import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -118,21 +116,6 @@ def _grid(
     return values
 
 
-def _read(path: pathlib.Path, algorithms: Sequence[Algorithm]) -> list[Point]:
-    """Return the points that a JSON file lists."""
-    source = f"points_file is {path}"
-    try:
-        every = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source}, which can't be read: {error}") from None
-    if not isinstance(every, list) or not every:
-        raise InputError(f"{source}: it must hold a list of points, one or more")
-    if not all(isinstance(point, dict) for point in every):
-        raise InputError(f"{source}: each point must be an object, NAME: VALUE")
-    check(every, *algorithms, source=f"{source}: ")
-    return every
-
-
 def check(every: Iterable[Point], *algorithms: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed."""
     try:
@@ -174,16 +157,11 @@ def _why_not(name: str, algorithm: Algorithm) -> str:
 def make_points(
     grid: Sequence[str],
     random: int | None,
-    points_file: pathlib.Path | None,
     *,
     seed: int,
     algorithms: Sequence[Algorithm],
 ) -> list[Point]:
     """Return the points of a sweep, of all its agents."""
-    if points_file is not None:
-        if grid or random is not None:
-            raise InputError("points_file can't be combined with grid or random")
-        return _read(points_file, algorithms)
     values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithms)
     if random is None:
         every = itertools.product(*values.values())
