@@ -82,7 +82,8 @@ class FitProgress:
         Read it in the callback; the copy may be kept.
 
         Raises:
-          RuntimeError: if it is first read after training has gone on.
+          RuntimeError: if it is first read after training has gone on, which has used
+            their memory.
         """
         return self.copy_states()
 
@@ -135,17 +136,12 @@ class _Training:
 
     def progress(self, metrics: _Columns, evaluation: _Columns | None) -> FitProgress:
         """Return the progress after a chunk, with its metrics and evaluation."""
-        done, env_steps = self.done, self.done * self.members.config.batch_steps
+        states, env_steps = self.states, self.done * self.members.config.batch_steps
 
         def copy_states() -> TrainState:
-            if done != self.done:
-                raise RuntimeError(
-                    f"the states of iteration {done} are gone: read FitProgress.states "
-                    "in the callback"
-                )
-            return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
+            return jax.tree.map(lambda x: x.copy(), self.members.trim(states))
 
-        return FitProgress(done, env_steps, metrics, evaluation, copy_states)
+        return FitProgress(self.done, env_steps, metrics, evaluation, copy_states)
 
 
 class _Checkpoints:

@@ -231,15 +231,11 @@ def _describe(
         why = why or "a schedule that is a function"
     except ValueError as error:
         why = why or str(error)
-    if made_with is None:
-        name = type(getattr(env, "unwrapped", env)).__name__
-        return Sweep(name, algorithm, seeds, recording=recording, only_python=why)
-    name, settings = made_with
-    return Sweep(
-        name,
-        algorithm,
-        seeds,
-        settings=settings,
-        recording=recording,
-        only_python=why,
-    )
+    kind = type(getattr(env, "unwrapped", env)).__name__
+    name, settings = made_with or (kind, environments.Settings())
+    own: dict[str, Any] = {
+        "settings": settings,
+        "recording": recording,
+        "only_python": why,
+    }
+    return Sweep(name, algorithm, seeds, **own)
