@@ -187,27 +187,18 @@ def restore(
 
 
 def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:
-    """Return the states in a checkpoint, which training may delete meanwhile."""
-    for _ in range(5):
-        before = set(root.iterdir()) if root.is_dir() else set()
-        errors: list[str] = []
-        try:
-            if which == "best":
-                chosen = checkpoint.best(root)
-            else:
-                chosen, errors = checkpoint.latest(root)
-            if chosen is None:
-                scored = " with a score" if which == "best" else ""
-                raise ValueError(f"it has no whole checkpoint{scored}")
-            states = chosen.restore(like)
-        except (ValueError, OSError):
-            if all(path.exists() for path in before):
-                raise
-        else:
-            for error in errors:
-                print(f"warning: {error}", file=sys.stderr)
-            return states
-    raise ValueError(f"training deletes {root} sooner than it can be read: try again")
+    """Return the states in a checkpoint."""
+    errors: list[str] = []
+    if which == "best":
+        chosen = checkpoint.best(root)
+    else:
+        chosen, errors = checkpoint.latest(root)
+    if chosen is None:
+        scored = " with a score" if which == "best" else ""
+        raise ValueError(f"it has no whole checkpoint{scored}")
+    for error in errors:
+        print(f"warning: {error}", file=sys.stderr)
+    return chosen.restore(like)
 
 
 def states_of(
