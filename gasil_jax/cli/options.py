@@ -57,8 +57,7 @@ class Options:
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
         MODULE:CLASS. Each has its own settings: this help shows those of the one that
-        is named beside it. Several, separated by commas, are trained side by side, each
-        from its own preset: the points of a sweep.
+        is named beside it.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -153,31 +152,25 @@ def read(
         if not first.config.is_file():
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
-    every, default = _defaults(kind, first, stored, origin)
+    algorithm, default = _defaults(kind, first, stored, origin)
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
-    _add_algorithms(parser, every)
-    values = parser.read(words, _why_not(every[0]))
+    _add_algorithm(parser, algorithm)
+    values = parser.read(words, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(words)}
-    switches = [model.switch for model in REWARD_MODELS]
-
-    def changed(algorithm: Algorithm) -> Algorithm:
-        """Return an algorithm with those of the given values that it has."""
-        on_or_off = {x: value for x, value in given.items() if x in switches}
-        algorithm = algorithm.replace(**on_or_off)
-        own = {x: value for x, value in given.items() if x in algorithm.settings}
-        return algorithm.replace(**own)
-
+    # A model of rewards that is off has options too.
+    switches = {x: given[x] for x in _switches(algorithm) if x in given}
     with input_checked():
-        algorithms_ = tuple(map(changed, every))
+        algorithm = algorithm.replace(**switches)
+        own = {x: value for x, value in given.items() if x in algorithm.settings}
+        algorithm = algorithm.replace(**own)
     requested = Sweep(
         options.env,
-        algorithms_[0],
+        algorithm,
         _seeds(options, stored),
-        others=algorithms_[1:],
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
@@ -197,9 +190,8 @@ def read(
     return options, requested
 
 
-def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
-    """Add an option for each setting; those of several agents have one."""
-    algorithm, *others = every
+def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
+    """Add an option for each setting."""
     agent, own = algorithm.agent, {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
@@ -207,8 +199,6 @@ def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
         parser.add_fields(model, model.switch, own.get(model, model()))
     for each in algorithm.own_models:
         parser.add_fields(type(each), each.name, each, all_shown=True)
-    for other in others:
-        parser.add_fields(type(other.agent), other.agent.name, other.agent)
 
 
 def _first_options(words: Sequence[str]) -> argparse.Namespace:
@@ -233,12 +223,12 @@ def _first_options(words: Sequence[str]) -> argparse.Namespace:
 
 def _defaults(
     kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
-) -> tuple[Sequence[Algorithm], Options]:
-    """Return the agents' algorithms and the options that hold where none are given."""
+) -> tuple[Algorithm, Options]:
+    """Return the algorithm and the options that hold where none are given."""
     if stored is not None:
         own_models = [model.name for model in stored.algorithm.own_models]
         for name, given, own in (
-            ("agent", first.agent, stored.agent),
+            ("agent", first.agent, stored.algorithm.agent.name),
             ("preset", first.preset, stored.preset),
             ("rewards", first.rewards, own_models),
         ):
@@ -247,33 +237,30 @@ def _defaults(
                     f"{origin}, where {name} was {own}, is {given}: leave it "
                     "out or name another one"
                 )
-        return stored.algorithms, kind(
+        return stored.algorithm, kind(
             env=stored.env,
-            agent=stored.agent,
+            agent=stored.algorithm.agent.name,
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
             rewards=tuple(own_models),
             **_switches(stored.algorithm),
         )
-    agents = (first.agent or Options.agent).split(",")
-    for name in agents:
-        if agents.count(name) > 1:
-            raise InputError(f"agent has {name!r} twice: name it once")
     with input_checked():
-        every = [_default(name, first) for name in agents]
+        algorithm = _default(first)
     missing: Any = dataclasses.MISSING
-    return every, kind(
+    return algorithm, kind(
         env=missing,
-        agent=",".join(agents),
+        agent=algorithm.agent.name,
         preset=first.preset or presets.DEFAULT,
-        **_switches(every[0]),
+        **_switches(algorithm),
     )
 
 
-def _default(name: str, first: argparse.Namespace) -> Algorithm:
+def _default(first: argparse.Namespace) -> Algorithm:
     """Return the algorithm from which an agent starts."""
-    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
+    agent = descriptions.find_agent(first.agent or Options.agent)
+    preset = first.preset or presets.DEFAULT
     algorithm = Algorithm(agent())
     if first.env is not None:
         algorithm = presets.preset(
@@ -346,26 +333,17 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
                 options.grid,
                 options.random,
                 seed=options.first_seed,
-                algorithms=requested.algorithms,
+                algorithm=requested.algorithm,
             )
-        elif stored is None and not requested.others:
+        elif stored is None:
             raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or several "
-                "agents"
+                "grid is empty: it must be NAME=VALUE,..., or use --random"
             )
     if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
     named = named or [{}]
-    if requested.others:
-        agents = [each.agent.name for each in requested.algorithms]
-        named = [
-            {"agent": agent, **point}
-            for agent in agents
-            for point in named
-            if point.get("agent", agent) == agent
-        ]
-    points.check(named, *requested.algorithms)
-    every = points.completed(named, *requested.algorithms)
+    points.check(named, requested.algorithm)
+    every = points.completed(named, requested.algorithm)
     return dataclasses.replace(requested, points=every)
 
 
@@ -377,8 +355,7 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        for each in requested.algorithms:
-            algorithms.check(each)
+        algorithms.check(requested.algorithm)
         trackers.check(requested.recording.log)
     check_minimum(options, devices=1)
     counts = (x for x in names(Recording) if x != "log")
@@ -406,20 +383,19 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
     """Print a note if the default preset has nothing for the agent and the task."""
-    for each in requested.algorithms:
-        lacking = presets.describe_lack(
-            options.env,
-            each.agent.name,
-            presets.DEFAULT,
-            reward_delay=requested.settings.reward_delay,
-        )
-        default = options.preset == presets.DEFAULT
-        default &= not options.resume and options.config is None
-        if default and lacking is not None:
-            more = ""
-            if environments.is_discrete(env):
-                more = " (--preset gymnax has one setting for discrete actions)"
-            note(f"{lacking}: options that are not given have their defaults{more}")
+    lacking = presets.describe_lack(
+        options.env,
+        requested.algorithm.agent.name,
+        presets.DEFAULT,
+        reward_delay=requested.settings.reward_delay,
+    )
+    default = options.preset == presets.DEFAULT
+    default &= not options.resume and options.config is None
+    if default and lacking is not None:
+        more = ""
+        if environments.is_discrete(env):
+            more = " (--preset gymnax has one setting for discrete actions)"
+        note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

@@ -12,7 +12,7 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import output_file, plotting, results, saved, tables
+from gasil_jax.host import output_file, plotting, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -24,8 +24,7 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of runs and sweeps, each a curve of its own, and a sweep over agents
-        one for each agent.
+      runs: folders of runs and sweeps, each a curve of its own.
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
@@ -193,20 +192,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{len(options.runs)} runs"
         )
     output_file.check(options.out, (".png", ".pdf", ".svg"))
-    read_of: list[tuple[pathlib.Path, Curves]] = []
-    for folder, label in zip(options.runs, labels, strict=True):
-        best = results.best_of_agents(folder) if options.point is None else {}
-        points: list[tuple[str | None, int | None]] = [*best.items()]
-        for agent, point in points or [(None, options.point)]:
-            own = f"{label}, {agent}" if label and agent else label
-            curves = read(folder, own, point, metric=options.metric)
-            read_of.append((folder, curves))
-    told = [run.label for _, run in read_of]
+    runs = [
+        read(folder, label, options.point, metric=options.metric)
+        for folder, label in zip(options.runs, labels, strict=True)
+    ]
+    told = [run.label for run in runs]
     runs = [
         run._replace(label=f"{run.label} ({folder})")
         if told.count(run.label) > 1
         else run
-        for folder, run in read_of
+        for folder, run in zip(options.runs, runs, strict=True)
     ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:

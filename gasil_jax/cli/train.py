@@ -48,7 +48,7 @@ def train(
                 env,
                 needed,
                 requested.recording,
-                title=f"{requested.env} {requested.agent}",
+                title=f"{requested.env} {requested.algorithm.agent.name}",
                 interruption=interruption,
             )
         trained = requested.trained(folder)

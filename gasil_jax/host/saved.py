@@ -46,7 +46,7 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     """
     stored = sweep.described(folder)
     chosen = _choose_point(folder, stored["points"], point)
-    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
+    agent = stored["algorithm"].get("agent")
     if stored["only_python"] is None:
         every = programs_of(folder, sweep.made(folder, stored), chosen)
     else:
