@@ -37,7 +37,6 @@ from gasil_jax.train import TrainState
 # after each chunk.
 _SECONDS_PER_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
-_AFTER_COMPILATION = "stopping after compilation; Ctrl-C again quits now"
 
 _Columns = Mapping[str, np.ndarray]
 
@@ -284,11 +283,7 @@ def drive(
 
     started = time.monotonic()
     if training.left:
-        what = "compiling training and first states"
-        with (
-            interruption.answering(_AFTER_COMPILATION),
-            progress.aside(what, at_once=True),
-        ):
+        with progress.aside("compiling training and first states", at_once=True):
             training.compile()
     compile_seconds = time.monotonic() - started
 

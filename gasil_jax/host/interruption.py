@@ -7,6 +7,9 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
+#: What a signal is answered with at once: a compilation or a chunk ends before.
+ANSWER = "stopping soon; Ctrl-C again quits now"
+
 
 class Interrupted(Exception):
     """Raised when a signal has stopped a run early; its progress is saved.
@@ -40,7 +43,6 @@ class Interruption:
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
         self._before: dict[int, Any] = {}
-        self._answer: str | None = None
 
     def __enter__(self) -> "Interruption":
         # Python allows signal handlers only in the main thread.
@@ -52,20 +54,10 @@ class Interruption:
     def __exit__(self, *exception: object) -> None:
         self._restore()
 
-    @contextlib.contextmanager
-    def answering(self, text: str) -> Iterator[None]:
-        """Print a line when a signal is received in the `with` block."""
-        self._answer = text
-        try:
-            yield
-        finally:
-            self._answer = None
-
     def _record(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
         self._restore()
-        if self._answer is not None:
-            print(self._answer, file=sys.stderr, flush=True)
+        print(ANSWER, file=sys.stderr, flush=True)
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

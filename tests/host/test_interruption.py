@@ -10,7 +10,7 @@ from small_training import FLAGS
 from test_progress import wait_for_text
 
 from gasil_jax import run
-from gasil_jax.host import checkpoint, driver, folders
+from gasil_jax.host import checkpoint, folders, interruption
 
 
 @pytest.fixture(autouse=True)
@@ -33,7 +33,7 @@ def test_ctrl_c_while_compiling_is_answered_at_once(
         assert threading.current_thread() is not threading.main_thread()
         os.kill(os.getpid(), signal.SIGINT)
         told = ""
-        while driver._AFTER_COMPILATION not in told:
+        while interruption.ANSWER not in told:
             more = wait_for_text(capsys)
             assert more
             told += more
