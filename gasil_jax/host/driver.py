@@ -81,8 +81,7 @@ class FitProgress:
         Read it in the callback; the copy may be kept.
 
         Raises:
-          RuntimeError: if it is first read after training has gone on, which has used
-            their memory.
+          RuntimeError: if it is first read after training has gone on.
         """
         return self.copy_states()
 
@@ -135,12 +134,18 @@ class _Training:
 
     def progress(self, metrics: _Columns, evaluation: _Columns | None) -> FitProgress:
         """Return the progress after a chunk, with its metrics and evaluation."""
-        states, env_steps = self.states, self.done * self.members.config.batch_steps
+        done, env_steps = self.done, self.done * self.members.config.batch_steps
 
         def copy_states() -> TrainState:
-            return jax.tree.map(lambda x: x.copy(), self.members.trim(states))
+            # JAX may crash at arrays whose memory training has used since.
+            if done != self.done:
+                raise RuntimeError(
+                    f"the states of iteration {done} are gone: read FitProgress.states "
+                    "in the callback"
+                )
+            return jax.tree.map(lambda x: x.copy(), self.members.trim(self.states))
 
-        return FitProgress(self.done, env_steps, metrics, evaluation, copy_states)
+        return FitProgress(done, env_steps, metrics, evaluation, copy_states)
 
 
 class _Checkpoints:
