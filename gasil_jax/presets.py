@@ -124,14 +124,6 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     }
 
 
-def _scaled(decompose_rewards: bool) -> Rows:
-    return {
-        (env, agent): scaled(size, decompose_rewards)
-        for agent in RULED
-        for env, size in ACTION_SIZES.items()
-    }
-
-
 def is_ruled(agent: str, name: str) -> bool:
     """Return whether a preset has the rule "scaled" for an agent."""
     return agent in RULED if name == "scaled" else (name, agent) == (DEFAULT, RULED[-1])
@@ -149,7 +141,7 @@ PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(
         _searched("dense", _ADAPTIVE), _searched("delayed", ADAPTIVE_DELAYED)
     ),
-    "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
+    "scaled": Preset({}, {}),  # a rule, see `scaled`
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
         {
@@ -227,12 +219,10 @@ def preset(
             )
         row = scaled(size, decompose_rewards=reward_delay > 1)
         return Algorithm(kind()).replace(**row)
-    rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and name != DEFAULT:
-        tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
-        raise ValueError(f"{lacking}: it has {agents} on {tasks}")
-    row = rows.get((env, kind.name), {})
+        raise ValueError(f"{lacking}: it is for {', '.join(RULED)}")
+    row = _rows(name, reward_delay).get((env, kind.name), {})
     return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
@@ -242,10 +232,8 @@ def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str 
     if PRESETS[name].every or is_ruled(agent, name) or (env, agent) in rows:
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"
-    return (
-        f"preset {name!r} has nothing for agent {agent!r} on {env} with {rewards} "
-        "rewards"
-    )
+    what = f"agent {agent!r} on {env} with {rewards} rewards"
+    return f"preset {name!r} has nothing for {what}"
 
 
 def _rows(name: str, reward_delay: int) -> Rows:

@@ -69,7 +69,7 @@ mass --alpha LONGx | alpha is 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx
 mass --agent gail | expert is missing
 mass --agent gail --expert nowhere.npz | it must be an .npz file
 mass --agent gail --expert minari:nothing/there-v0 | minari:nothing/there-v0
-mass --agent gasil --preset scaled | it has ppo, ppo+novelty, ppo+gasil+n
+mass --agent gasil --preset scaled | it is for ppo, ppo+novelty, ppo+gasil+n
 corridor --policy-components 4 | policy_components is 4: it must be 1, the
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
