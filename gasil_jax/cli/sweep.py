@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from typing import cast
 
 from gasil_jax.cli import options as options_
-from gasil_jax.cli import parsing, train
+from gasil_jax.cli import parsing, run
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.out is None:
             raise InputError("shard needs --out and the folder of the whole sweep")
-    train.train(options, requested, program, shard=shard)
+    run.train(options, requested, program, shard=shard)
     return 0
 
 
@@ -76,5 +76,5 @@ def _launch(
     requested = requested.continued_from(options.out)
     with folders.lock(options.out, seconds=60.0):
         trained, env = requested.trained(options.out), training.make_env(requested)
-        results = train.write(options.out, requested, env, trained)
-    train.tell(options.out, results, env)
+        results = run.write(options.out, requested, env, trained)
+    run.tell(options.out, results, env)
