@@ -22,6 +22,7 @@ from gasil_jax import train
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, Range
 from gasil_jax.errors import refusal
+from gasil_jax.host import resources
 
 
 def member(states: Any, index: int) -> Any:
@@ -180,6 +181,7 @@ class Members:
         )
         arguments = shapes, np.int32(0), self.data
         traced = self.advance.trace(*arguments)
+        resources.check_arrays(traced.jaxpr.jaxpr, self.algorithm, self.devices)
 
         def first() -> Any:
             moved = self.init() if states is None else self.to_devices(states)

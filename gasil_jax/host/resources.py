@@ -3,10 +3,11 @@
 import contextlib
 import math
 import pathlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
+from jax.extend import core
 
 from gasil_envs import wrappers
 from gasil_jax import train
@@ -122,6 +123,39 @@ def check_memory(
             f"{config.num_envs} and batch_steps {config.batch_steps}, and "
             f"{_in_words(free)} are free: at most {fit} fit"
         )
+
+
+def check_arrays(
+    traced: core.Jaxpr, algorithm: Algorithm, devices: Sequence[jax.Device]
+) -> None:
+    """Raise `InputError` if a single array of a traced program does not fit memory.
+
+    So a count that shapes an array is refused whatever it is, also a user's own. The
+    program is one function that each of the devices runs.
+    """
+    inner = (x for part in core.subjaxprs(traced) for x in _arrays(part))
+    largest, free = max(inner, key=_size, default=None), available(devices)
+    if largest is None or free is None or len(devices) * _size(largest) <= free:
+        return
+    counts = [
+        f"{name} {value}"
+        for name, value in algorithm.settings.items()
+        if type(value) is int and value > 1 and value in largest.shape
+    ]
+    shaped = f", with {' and '.join(counts)}" if counts else ""
+    raise InputError(
+        f"training has an array of shape {largest.shape}{shaped}: it needs "
+        f"{_in_words(len(devices) * _size(largest))} of memory, and {_in_words(free)} "
+        "are free"
+    )
+
+
+def _arrays(program: core.Jaxpr) -> Iterator[Any]:
+    """Yield the shape and dtype of each array that a program makes."""
+    for equation in program.eqns:
+        yield from (x.aval for x in equation.outvars if hasattr(x.aval, "dtype"))
+    for part in core.subjaxprs(program):
+        yield from _arrays(part)
 
 
 def check_episodes(

@@ -7,7 +7,8 @@ from refusals import refused
 from small_training import FLAGS
 
 import gasil_jax
-from gasil_jax import run
+from gasil_jax import config, run
+from gasil_jax.errors import InputError
 from gasil_jax.host import environments, resources
 from gasil_jax.host.members import make_members
 
@@ -39,6 +40,25 @@ def test_a_run_that_cannot_fit_is_refused_with_numbers(monkeypatch, tmp_path, ca
     monkeypatch.setattr(resources, "available", lambda devices: 10_000)
     assert "free: at most 0 fit" in refused(capsys, run, *arguments)
     assert not (tmp_path / "out").exists()
+
+
+class Wide(gasil_jax.Agent):
+    rows: int = config.count(1)
+
+    def update_and_reward(self, state, context, key):
+        rows = jax.random.normal(key, (self.rows, 1000))
+        return state, context.rollout.reward + rows.mean(), {}
+
+
+def test_any_count_that_shapes_a_large_array_is_refused_before_compiling(monkeypatch):
+    monkeypatch.setattr(jax.stages.Lowered, "compile", None)
+    env = gasil_jax.make_env("point_mass")
+    algorithm = gasil_jax.Algorithm(Wide(rows=2**31 - 1))
+    told = (
+        r"an array of shape \(1, 2147483647, 1000\), with rows 2147483647: it needs 8"
+    )
+    with pytest.raises(InputError, match=told):
+        make_members(env, algorithm, [0]).compile()
 
 
 def write_group(folder, **values):
