@@ -99,7 +99,7 @@ def test_a_minari_data_set_is_an_expert(data_set, tmp_path, monkeypatch):
     described.write_text(described.read_text().replace('"hdf5"', '"arrow"'))
     for package, message in (
         ("pyarrow", r"'minari:test/expert-v0'.*pyarrow"),
-        ("h5py", r"read with gasil_jax\[minari\] \(.*h5py"),
+        ("minari", r"read with gasil_jax\[minari\] \(.*minari"),
     ):
         monkeypatch.setitem(sys.modules, package, None)
         with pytest.raises(ValueError, match=message) as refusal:
