@@ -1,12 +1,7 @@
 """Train a sweep: ``python -m gasil_jax.sweep --env hopper --grid alpha=0.02,0.1``.
 
-Points that differ only in traced numbers run in one compiled program, with seeds x
-points vmapped and sharded. Points that differ in a count (such as buffer size or
-discriminator updates) are grouped, and each group compiles once.
-
 A run that is there is never trained again. So --resume continues a sweep, and may add
-points and seeds to it. With --shard 3/8 an eighth of all points and seeds is trained in
-the same folder; the tables are written once no run is missing.
+points and seeds to it.
 """
 
 import argparse

@@ -50,11 +50,6 @@ def prepare(
         _check(env, each)
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, visible)
-    if num_devices is not None and 0 < num_members < num_devices:
-        note(
-            f"devices is {num_devices}, of which {num_members} are used, one for each "
-            "run"
-        )
     _note_if_no_episode_ends(env, [each.algorithm for each in programs])
     return env
 
