@@ -49,11 +49,9 @@ def run_on_ray(
         failed = _failures(ray, program, jobs, devices)
     if failed:
         told = ", ".join(f"{name} ({why})" for name, why in failed.items())
-        if list(failed.values()) == [f"status {_BAD_INPUT}"] * len(jobs):
-            raise InputError(f"{told}: bad input, see above")
         raise ChildProcessError(
-            f"{told} failed; the others are done. Continue with the same command and "
-            "--resume"
+            f"{told} failed, see above; the others are done. Continue with the same "
+            "command and --resume"
         )
 
 
@@ -62,7 +60,6 @@ def _failures(
 ) -> dict[str, str]:
     """Run jobs on a cluster; return why some have failed, by the job's name."""
     on_gpu = ray.cluster_resources().get("GPU", 0) >= 1
-    cpus = 1 if on_gpu else devices or 1
     # By default a job would use every core of its node.
     more = [] if on_gpu or devices else ["--devices", "1"]
     # JAX sets up its devices once per process, so each job needs its own. The process
@@ -71,7 +68,7 @@ def _failures(
         max_calls=1,
         max_retries=RETRIES,
         retry_exceptions=[_Unfinished],
-        num_cpus=cpus,
+        num_cpus=1 if on_gpu else devices or 1,
         num_gpus=int(on_gpu),
     )(_run_module)
     names = {
