@@ -1,24 +1,8 @@
 """Presets: settings that runs start from, by environment, agent and reward delay.
 
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
-the settings; a flag overrides a row.
-
-"tuned" has what a search chose for an agent on a task, with the number of environments
-and the normalization of rewards that it ran with; alpha suits only that normalization.
-Which rows are from which search is in docs/running.md. An agent without a row for a
-task starts from the defaults.
-
-"scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
-learning rate, exploration and lambda depend on the dimension of an action, which counts
-as two where actions are discrete. Delayed rewards are decomposed. "tuned" has this rule
-for PPO+GASIL+NOVELTY too.
-
-"gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
-for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
-
-"paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
-values of its appendix. Of what the appendix searches it has what our search chose on
-each task (docs/results/paper_figures.md). Rewards are normalized.
+the settings; a flag overrides a row. docs/running.md says what each preset is for, and
+from which search its rows are.
 """
 
 import json
