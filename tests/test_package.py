@@ -32,7 +32,7 @@ sys.exit(gasil_jax.run.main({arguments}))
 
 
 def test_the_commands_are_listed(capsys):
-    runpy.run_module("gasil_jax", run_name="__main__")
+    runpy.run_path(package.__file__, run_name="__main__")
     printed = capsys.readouterr().out
     for command in package.COMMANDS:
         assert importlib.util.find_spec(f"gasil_jax.{command}")

@@ -30,14 +30,7 @@ POSITIONAL = {"positional": True}
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are `InputError`, one line each.
-
-    Args:
-      program: name of the module that was started.
-      usage: what follows it in the usage line.
-      kind: the dataclass whose docstring says what the command does.
-      shown: names of options that `--help` shows; default all. `--help-all` shows all.
-    """
+    """A parser whose errors are `InputError`; `--help` shows the options `shown`."""
 
     def __init__(
         self,

@@ -104,12 +104,7 @@ def _read_tables(
 def draw(
     runs: Sequence[Curves], path: pathlib.Path, metric: str = "episode_return"
 ) -> None:
-    """Write the figure: interquartile means over seeds, with their 95% intervals.
-
-    Each environment has a row of three panels. The left one shows returns over
-    environment steps, with evaluations dashed; the middle one final returns, with a dot
-    for each seed; the right one the share of seeds above each final return.
-    """
+    """Draw each environment's returns, final returns and performance profiles."""
     from matplotlib.figure import Figure
 
     envs = list(dict.fromkeys(run.env for run in runs))

@@ -300,11 +300,7 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:
-    """Rename the checkpoints after an iteration to NAME.damaged.
-
-    They are newer than the newest undamaged checkpoint. If they kept their names,
-    `prune` would keep them instead of undamaged ones.
-    """
+    """Rename damaged checkpoints, so that `prune` does not keep them for others."""
     for folder in _folders(root):
         if int(folder.name) > newer_than:
             renamed, number = folder.with_name(f"{folder.name}{_DAMAGED}"), 1

@@ -216,13 +216,7 @@ def drive(
     trackers: Sequence[Tracker] = (),
     callback: Callback | None = None,
 ) -> Outcome:
-    """Train to the end, from the newest undamaged checkpoint if the folder has one.
-
-    After each chunk a signal is answered with a checkpoint and `Interrupted`, and the
-    callback may end training. The labels, (members,) each, identify the members in the
-    tables; `progress` has counted `steps_before` environment steps already. The
-    trackers are closed at the end.
-    """
+    """Train to the end, from the newest undamaged checkpoint if the folder has one."""
     root = folder / "checkpoints"
     training, record = _restored(members, root, progress)
     rows: Mapping[str, Any] = record or {}

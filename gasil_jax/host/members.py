@@ -47,10 +47,7 @@ def member(states: Any, index: int) -> Any:
 def advance_members(
     env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
-    """Train members side by side for at most `chunk_size(config)` iterations.
-
-    Metrics are (members, chunk), NaN after the first `num_iterations` columns.
-    """
+    """Train members for some iterations; metrics are (members, chunk), then NaN."""
     # A jitted function is traced once for both uses, which saves seconds.
     step = jax.jit(
         jax.vmap(lambda state: train.train_step(env, algorithm, state, data=data))
@@ -80,10 +77,7 @@ def chunk_size(config: Config) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Members:
-    """The members that train in one program.
-
-    Their arrays are padded to a multiple of the number of devices: (padded, ...).
-    """
+    """The members that train in one program; their arrays are padded: (padded, ...)."""
 
     env: Any  # one environment
     algorithm: Algorithm  # the algorithm that the members share
@@ -234,10 +228,7 @@ class Members:
         )
 
     def trim(self, states: Any) -> Any:
-        """Return the members' arrays without the padding, (members, ...).
-
-        If there is padding, they are NumPy arrays and random keys.
-        """
+        """Return the members' arrays without the padding, (members, ...)."""
         if not self._padding:
             return states
 

@@ -90,11 +90,7 @@ def _partial(path: pathlib.Path) -> pathlib.Path:
 
 @contextlib.contextmanager
 def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yield a temporary path beside the file, which is renamed to it at the end.
-
-    A reader never sees a half written file, and several processes may write the same
-    file. If the block raises an error, the temporary file is deleted.
-    """
+    """Yield a temporary path beside the file, which is renamed to it at the end."""
     partial = _partial(path)
     try:
         with errors_named(path):

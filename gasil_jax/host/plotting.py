@@ -111,10 +111,7 @@ def learning_curve(
     title: str,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Save the returns, (seeds, iterations), as a PNG: all seeds, mean and interval.
-
-    Evaluations are as in `draw_returns`.
-    """
+    """Save the returns, (seeds, iterations), of all seeds, with mean and interval."""
     from matplotlib.figure import Figure
 
     steps, returns = binned_returns(env_steps, episode_return)

@@ -53,10 +53,7 @@ def in_words(point: Point) -> str:
 
 
 def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
-    """Return points that all have the same names, without repetitions.
-
-    A point that lacks a name has the algorithm's own value.
-    """
+    """Return points that all have the same names, without repetitions."""
     listed = list(every)
     varied = list(dict.fromkeys(name for point in listed for name in point))
     kinds, own = _kinds(algorithm), algorithm.settings

@@ -19,10 +19,7 @@ _SECONDS_BEFORE_ANNOUNCEMENT = 1.0
 
 @contextlib.contextmanager
 def announced(title: str, name: str, *, at_once: bool = False) -> Iterator[None]:
-    """Print a line to stderr if the `with` block takes more than a second.
-
-    While it lasts, further lines say for how long it has.
-    """
+    """Print what the `with` block does if it takes more than a second, and how long."""
     ended, started = threading.Event(), time.monotonic()
 
     def tell() -> None:
@@ -48,17 +45,7 @@ def _line(title: str, text: str) -> None:
 
 
 class Progress:
-    """Shows the steps, the return, steps/s and the time left.
-
-    The return is the interquartile mean over members.
-
-    Args:
-      title: name of what is trained.
-      total_steps: environment steps over all members.
-      num_members: number of members; the steps of one member are shown.
-      members: what to call the members.
-      shown: whether anything is shown at all.
-    """
+    """Shows one member's steps, the members' mean return, steps/s and the time left."""
 
     def __init__(
         self,
@@ -85,10 +72,7 @@ class Progress:
 
     @contextlib.contextmanager
     def aside(self, name: str, *, at_once: bool = False) -> Iterator[None]:
-        """Show what the `with` block does, if it takes more than a second or at once.
-
-        Its time does not count towards the training speed.
-        """
+        """Show what the `with` block does; its time does not count in the speed."""
         started = time.monotonic()
         with contextlib.ExitStack() as stack:
             if self._shown:

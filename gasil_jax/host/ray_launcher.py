@@ -33,11 +33,7 @@ def _run_module(program: str, arguments: Sequence[str]) -> int:
 def run_on_ray(
     program: str, jobs: Mapping[str, Sequence[str]], devices: int | None
 ) -> None:
-    """Run jobs as tasks of a Ray cluster, with a GPU each if it has GPUs, else on CPUs.
-
-    The cluster is RAY_ADDRESS's, else a running one, else a new one. If a task's worker
-    or node dies, the task is run again elsewhere.
-    """
+    """Run jobs on a cluster, with a GPU each if it has any; their nodes may die."""
     try:
         import ray
     except ImportError:

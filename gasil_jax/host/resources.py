@@ -60,10 +60,7 @@ def need(env: Any, algorithm: Algorithm) -> int:
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
-    """Return the free bytes of the devices together; None if unknown.
-
-    All devices get equal shares, so the one with the least free memory counts.
-    """
+    """Return the free bytes of the devices, in equal shares; None if unknown."""
     if devices[0].platform != "cpu":
         every = [device.memory_stats() or {} for device in devices]
         if any("bytes_limit" not in stats for stats in every):
@@ -82,11 +79,7 @@ def _free_in_control_groups(
     root: pathlib.Path = pathlib.Path("/sys/fs/cgroup"),
     own: pathlib.Path = pathlib.Path("/proc/self/cgroup"),
 ) -> list[int]:
-    """Return the bytes left below each limit of this process's control group.
-
-    A group's limit also holds for the groups in it. The kernel's cache of files counts
-    as free.
-    """
+    """Return what is left below each limit of this process's control groups."""
     free: list[int] = []
     # Only Linux has control groups, and a group may have no limit.
     with contextlib.suppress(OSError, LookupError):

@@ -100,10 +100,7 @@ def _equal(first: Columns, second: Columns) -> bool:
 
 
 def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
-    """Return all runs' columns, (points, seeds, rows).
-
-    A run has NaN after its last row, and where it lacks a metric of another agent.
-    """
+    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row."""
     curves = {}
     for name in dict.fromkeys(name for own in every for name in own):
         columns = [own.get(name, np.empty(0)) for own in every]

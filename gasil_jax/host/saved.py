@@ -39,11 +39,7 @@ from gasil_jax.host.sweep import Sweep
 
 
 def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
-    """Return the environment's and the agent's name, and the programs of a point.
-
-    They have that point's runs alone. Only their tables can be read if Python alone can
-    make what was trained.
-    """
+    """Return the environment's and the agent's name, and the programs of a point."""
     stored = sweep.described(folder)
     chosen = _choose_point(folder, stored["points"], point)
     agent = stored["algorithm"].get("agent")
@@ -118,11 +114,7 @@ def load(
     env: Any = None,
     algorithm: Algorithm | None = None,
 ) -> tuple[Any, Algorithm, list[int], Any]:
-    """Return environment, algorithm, seed numbers and states (seed, ...) of a point.
-
-    By default they are the best point by mean, all seeds, and the environment and the
-    algorithm that config.json describes; else see `load_policy`.
-    """
+    """Return environment, algorithm, seeds and states of a point; see `load_policy`."""
     for name, number in (("point", point), ("seed", seed)):
         if number is not None and number not in Range(-math.inf, whole=True):
             raise refusal(name, number, "a whole number")

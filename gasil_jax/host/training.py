@@ -96,11 +96,7 @@ def train_programs(
     callback: Callback | None = None,
     shown: bool = True,
 ) -> list[Outcome]:
-    """Train programs, one after the other, and return their outcomes.
-
-    Each program's folder is locked and lists its runs; once its training has ended it
-    has a training.json.
-    """
+    """Train programs, one after the other, in their folders; return their outcomes."""
     if not programs:
         return []
     num_members = sum(len(each.runs) for each in programs)
