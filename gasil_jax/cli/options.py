@@ -14,7 +14,7 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli import parsing
 from gasil_jax.cli.parsing import Parser, check_minimum, input_checked
 from gasil_jax.cli.reporting import HelpShown
-from gasil_jax.config import Config, names
+from gasil_jax.config import Config, names, validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
     descriptions,
@@ -23,7 +23,6 @@ from gasil_jax.host import (
     folders,
     points,
     sweep,
-    trackers,
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import note
@@ -131,7 +130,7 @@ def read(
     if "--list-envs" in words:
         print(*environments.names(), sep="\n")
         raise HelpShown(0)
-    first, stored = _first_options(words), None
+    first, stored = _first_options(kind, words), None
     if first.resume:
         if first.out is None:
             raise InputError("resume needs --out and the folder to continue")
@@ -194,23 +193,13 @@ def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
         parser.add_fields(type(each), each.name, each, all_shown=True)
 
 
-def _first_options(words: Sequence[str]) -> argparse.Namespace:
+def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namespace:
     """Return the options that decide which others there are, and their defaults."""
-
-    def delay(text: str) -> int:
-        try:
-            return max(1, points.whole_number(text))
-        except (ValueError, OverflowError):
-            return 1
-
-    parser = Parser("gasil_jax", "", Options)
-    for name in ("out", "config"):
-        parser.add_argument(f"--{name}", type=pathlib.Path, nargs="?")
-    for name in ("env", "agent", "preset"):
-        parser.add_argument(f"--{name}", nargs="?")
-    parser.add_argument("--rewards", nargs="*")
-    parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
-    parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
+    parser = Parser("gasil_jax", "", kind)
+    # None tells that they are not given.
+    deciding = ("env", "agent", "preset", "rewards")
+    parser.add_fields(kind, "run", kind(**dict.fromkeys(deciding)))  # type: ignore[arg-type]
+    parser.add_fields(Settings, "environment")
     return parser.parse_known_args(words)[0]
 
 
@@ -219,7 +208,7 @@ def _defaults(
 ) -> tuple[Algorithm, Options]:
     """Return the algorithm and the options that hold where none are given."""
     if stored is not None:
-        own_models = [model.name for model in stored.algorithm.own_models]
+        own_models = tuple(x.name for x in stored.algorithm.own_models)
         for name, given, own in (
             ("agent", first.agent, stored.algorithm.agent.name),
             ("preset", first.preset, stored.preset),
@@ -236,7 +225,7 @@ def _defaults(
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
-            rewards=tuple(own_models),
+            rewards=own_models,
             **_switches(stored.algorithm),
         )
     with input_checked():
@@ -349,10 +338,8 @@ def _check(options: Options, requested: Sweep) -> None:
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
         algorithms.check(requested.algorithm)
-        trackers.check(requested.recording.log)
+        validate(requested.recording)
     check_minimum(options, devices=1)
-    counts = (x for x in names(Recording) if x != "log")
-    check_minimum(requested.recording, **dict.fromkeys(counts, 1))
     check_minimum(requested.settings, max_episode_steps=1)
     if options.out is not None:
         folders.check_writable(options.out)

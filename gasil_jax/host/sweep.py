@@ -25,6 +25,7 @@ import jax
 
 from gasil_jax import algorithms
 from gasil_jax.algorithms import Algorithm
+from gasil_jax.config import count
 from gasil_jax.errors import InputError, refusal, shown
 from gasil_jax.host import (
     descriptions,
@@ -33,6 +34,7 @@ from gasil_jax.host import (
     json_files,
     points,
     programs,
+    trackers,
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import note
@@ -66,12 +68,14 @@ class Recording:
       log: trackers to log to besides metrics.csv: tensorboard, wandb.
     """
 
-    checkpoint_every: int | None = None
-    keep_checkpoints: int = 2
-    evaluate_every: int | None = None
-    evaluate_episodes: int = 10
-    video_every: int | None = None
-    log: tuple[str, ...] = ()
+    checkpoint_every: int | None = count(None)
+    keep_checkpoints: int = count(2)
+    evaluate_every: int | None = count(None)
+    evaluate_episodes: int = count(10)
+    video_every: int | None = count(None)
+    log: tuple[str, ...] = dataclasses.field(
+        default=(), metadata={"check": trackers.check}
+    )
 
 
 @dataclasses.dataclass(frozen=True)

@@ -131,20 +131,20 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 }
 
 
-def check(names: Sequence[str]) -> None:
+def check(setting: str, names: Sequence[str]) -> None:
     """Raise `ValueError` for a tracker that is unknown, not installed or repeated."""
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"log has {name!r} twice: name it once")
+            raise ValueError(f"{setting} has {name!r} twice: name it once")
         if name not in TRACKERS:
             allowed = ", ".join(TRACKERS)
-            raise ValueError(f"log is {name!r}: it must be one of {allowed}")
+            raise ValueError(f"{setting} is {name!r}: it must be one of {allowed}")
         package = TRACKERS[name][0]
         try:
             importlib.import_module(package)
         except ImportError:
             raise ValueError(
-                f"log is {name!r}: it needs the package {package} "
+                f"{setting} is {name!r}: it needs the package {package} "
                 f'(pip install "gasil_jax[{name}]")'
             ) from None
 

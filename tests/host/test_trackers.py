@@ -105,6 +105,7 @@ def test_a_program_of_a_sweep_is_told_with_its_own_values(
     tmp_path, monkeypatch, capsys
 ):
     """And with the name of the sweep's folder."""
+    pytest.importorskip("tensorboardX")
     monkeypatch.chdir(tmp_path)
     told = []
 
@@ -113,7 +114,6 @@ def test_a_program_of_a_sweep_is_told_with_its_own_values(
         raise InputError("enough")
 
     monkeypatch.setattr(trackers, "make", make)
-    monkeypatch.setattr(trackers, "check", lambda names: None)
     grid = ("--grid", "num_epochs=2,3", "--out", "programs/7")
     refused(capsys, sweep, *SMALL, "--log", "tensorboard", *grid)
     assert told == [("7", 2)]
