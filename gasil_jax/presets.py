@@ -1,30 +1,14 @@
 """Presets: settings that runs start from, by environment, agent and reward delay.
 
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
-the settings; a flag overrides a row.
-
-"tuned" has what a search chose for an agent on a task, with the number of environments
-and the normalization of rewards that it ran with; alpha suits only that normalization.
-Which rows are from which search is in docs/running.md. An agent without a row for a
-task starts from the defaults.
-
-"scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
-learning rate, exploration and lambda depend on the dimension of an action, which counts
-as two where actions are discrete. Delayed rewards are decomposed. PPO+GASIL+NOVELTY has
-an entropy bonus too, and this rule in "tuned" as well.
-
-"gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
-for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
-
-"paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
-values of its appendix. Of what the appendix searches it has what our search chose on
-each task (docs/results/paper_figures.md). Rewards are normalized.
+the settings; a flag overrides a row. docs/running.md says what each preset is for, and
+from which search its rows are.
 """
 
 import json
 import pathlib
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from gasil_envs import worlds
@@ -136,18 +120,6 @@ def _between(two: float, eight: float, action_size: int) -> float:
     return two * (1 - share) + eight * share
 
 
-def _rule(agent: str) -> Callable[[int, bool], Overrides]:
-    return scaled_with_entropy if agent == RULED[-1] else scaled
-
-
-def _scaled(decompose_rewards: bool) -> Rows:
-    return {
-        (env, agent): _rule(agent)(size, decompose_rewards)
-        for agent in RULED
-        for env, size in ACTION_SIZES.items()
-    }
-
-
 def is_ruled(agent: str, name: str) -> bool:
     """Return whether a preset has the rule "scaled" for an agent."""
     return agent in RULED if name == "scaled" else (name, agent) == (DEFAULT, RULED[-1])
@@ -165,7 +137,7 @@ PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(
         _searched("dense", _ADAPTIVE), _searched("delayed", ADAPTIVE_DELAYED)
     ),
-    "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
+    "scaled": Preset({}, {}),  # a rule, see `scaled`
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
         {
@@ -241,14 +213,13 @@ def preset(
                 f"action_size is None: preset {name!r} needs the dimension of {env}'s "
                 "actions, which is env.action_size, or 2 if they are discrete"
             )
-        row = _rule(kind.name)(size, reward_delay > 1)
+        rule = scaled_with_entropy if kind.name == RULED[-1] else scaled
+        row = rule(size, reward_delay > 1)
         return Algorithm(kind()).replace(**row)
-    rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and name != DEFAULT:
-        tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
-        raise ValueError(f"{lacking}: it has {agents} on {tasks}")
-    row = rows.get((env, kind.name), {})
+        raise ValueError(f"{lacking}: it is for {', '.join(RULED)}")
+    row = _rows(name, reward_delay).get((env, kind.name), {})
     return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
@@ -258,10 +229,8 @@ def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str 
     if PRESETS[name].every or is_ruled(agent, name) or (env, agent) in rows:
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"
-    return (
-        f"preset {name!r} has nothing for agent {agent!r} on {env} with {rewards} "
-        "rewards"
-    )
+    what = f"agent {agent!r} on {env} with {rewards} rewards"
+    return f"preset {name!r} has nothing for {what}"
 
 
 def _rows(name: str, reward_delay: int) -> Rows:
