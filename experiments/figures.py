@@ -495,7 +495,7 @@ _on_own_seeds = functools.partial(grid, seeds=20, first_seed=100)
 def _one_agent(
     tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
 ) -> Panels:
-    """Return the one agent and what it is compared with, all with the rule `scaled`."""
+    """Return the one agent and what it is compared with, all with its rule."""
     # Other tasks than robots have two dimensions, fewer, or discrete actions.
     sizes = presets.ACTION_SIZES
     robots = {env: env.removeprefix("sparse:").removesuffix("_noisy") for env in tasks}
@@ -505,7 +505,7 @@ def _one_agent(
             _ONE_DELAYED if delay > 1 else _ONE_ARMS,
             (delay,),
             base=None,
-            changes=presets.scaled(sizes.get(robot, 2), decompose_rewards=delay > 1),
+            changes=presets.scaled_with_entropy(sizes.get(robot, 2), delay > 1),
             total_steps=total_steps,
         )
         for env, robot in robots.items()
