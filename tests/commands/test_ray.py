@@ -15,7 +15,6 @@ import pytest
 from small_training import FLAGS
 
 from gasil_jax import sweep
-from gasil_jax.errors import InputError
 from gasil_jax.host import ray_launcher
 
 ray = pytest.importorskip("ray")
@@ -76,5 +75,6 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(
 
 def test_a_shard_that_fails_is_named(cluster):
     """Here a program that imports nothing, and returns 2 at an unknown option."""
-    with pytest.raises(InputError, match=r"shard 1/1 \(status 2\): bad input"):
+    told = r"shard 1/1 \(status 2\) failed, see above"
+    with pytest.raises(ChildProcessError, match=told):
         ray_launcher.run_on_ray("timeit", {"shard 1/1": ["--unknown"]}, 1)

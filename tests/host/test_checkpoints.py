@@ -3,7 +3,6 @@
 import errno
 import os
 import resource
-import shutil
 from unittest import mock
 
 import jax
@@ -12,7 +11,7 @@ import numpy as np
 import orbax.checkpoint
 import pytest
 
-from gasil_jax.host import checkpoint, saved
+from gasil_jax.host import checkpoint
 
 
 def write(root, iteration, score=None, state=None):
@@ -156,8 +155,8 @@ def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
     assert names(tmp_path) == ["00000002"]
 
 
-def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path, capfd):
-    """Each of Orbax's and TensorStore's threads has a traceback of its own."""
+def test_a_disk_that_is_full_during_a_checkpoint_is_told_in_a_line(tmp_path):
+    """Beside it, Orbax's and TensorStore's threads have tracebacks of their own."""
     state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
     _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     # No file may grow beyond this: writing fails as on a full disk.
@@ -168,7 +167,7 @@ def test_a_disk_that_is_full_during_a_checkpoint_is_one_line(tmp_path, capfd):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert str(told.value) == f"{tmp_path} can't be written: File too large"
-    assert "".join(capfd.readouterr()) == "" and names(tmp_path) == []
+    assert names(tmp_path) == []
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
@@ -176,20 +175,3 @@ def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "fsync", broken)
     with pytest.raises(checkpoint.WriteError, match=r"written: Input/output error$"):
         write(tmp_path, 1)
-
-
-def test_a_checkpoint_that_training_deletes_is_replaced_by_a_newer_one(
-    untrained_point_mass, tmp_path, monkeypatch
-):
-    out = shutil.copytree(untrained_point_mass, tmp_path / "out")
-    (folder,) = out.glob("programs/*/checkpoints/*")
-    restore, deleted = checkpoint.Checkpoint.restore, []
-
-    def while_training(self, like):
-        if not deleted:
-            deleted.append(self.folder.name)
-            self.folder.rename(self.folder.with_name("00000007"))
-        return restore(self, like)
-
-    monkeypatch.setattr(checkpoint.Checkpoint, "restore", while_training)
-    assert saved.load(out)[2] == [0] and deleted == [folder.name]

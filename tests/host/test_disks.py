@@ -2,12 +2,10 @@
 
 import errno
 import fcntl
-import io
 import os
 import re
 import resource
 import shutil
-import sys
 from unittest import mock
 
 import jax
@@ -18,7 +16,6 @@ from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import run
-from gasil_jax.cli import reporting
 from gasil_jax.host import checkpoint, folders, output_file, saved, tables
 
 #: What means something to a shell, to patterns, to URLs or to options, and a byte that
@@ -33,14 +30,6 @@ pytestmark = pytest.mark.usefixtures("figures")
 @pytest.fixture(scope="module")
 def env():
     return gasil_jax.make_env("point_mass")
-
-
-def test_a_name_that_the_terminal_cannot_show_is_printed(monkeypatch):
-    written = io.BytesIO()
-    strict = io.TextIOWrapper(written, encoding="ascii", write_through=True)
-    monkeypatch.setattr(sys, "stdout", strict)
-    assert reporting.reports_errors(lambda: print("in \udcffé") or 0)() == 0
-    assert written.getvalue() == b"in \\udcff\\xe9\n"
 
 
 def test_a_disk_without_locks_and_flushes_keeps_everything_and_is_told(
