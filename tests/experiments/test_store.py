@@ -125,6 +125,16 @@ def test_what_is_written_is_read_again_in_whatever_order_it_came(tmp_path):
     assert one.read_bytes() == other.read_bytes()
 
 
+def test_a_field_that_a_file_has_not_is_the_default(tmp_path, monkeypatch):
+    path = tmp_path / "hopper.npz"
+    older = run().experiment.replace('"num_epochs": 10, ', "")
+    assert older != run().experiment
+    monkeypatch.setattr(Run, "experiment", older)
+    write(path, {run(): record()})
+    monkeypatch.undo()
+    assert list(read(path)) == [run()]
+
+
 @pytest.mark.parametrize("content", [b"", b"no zip"])
 def test_a_damaged_file_is_told(tmp_path, content):
     path = tmp_path / "hopper.npz"
