@@ -1,4 +1,4 @@
-"""The installed JAX computes correct numbers."""
+"""The installed JAX computes correct numbers, and our permutations are its own."""
 
 import functools
 
@@ -9,6 +9,7 @@ import pytest
 
 import gasil_jax
 from gasil_jax import policy
+from gasil_jax.permutation import argsort, permutation
 
 
 @pytest.mark.compiled_as_for_users
@@ -100,3 +101,17 @@ def test_matrices_are_multiplied_in_full_precision():
     with jax.default_matmul_precision("default"):
         jaxpr = jax.make_jaxpr(lambda x: gasil_jax.train_step(env, ALGORITHM, x))(state)
     assert (highest, highest) not in set(products(jaxpr.jaxpr))
+
+
+@pytest.mark.parametrize("size", [1, 7, 2048, 3000, 2**16 + 1])
+def test_the_order_is_that_of_jax(size):
+    key = jax.random.key(size)
+    ours = jax.jit(permutation, static_argnums=1)(key, size)
+    np.testing.assert_array_equal(ours, jax.random.permutation(key, size))
+    assert ours.dtype == jnp.int32
+
+
+@pytest.mark.parametrize("highest", [1, 3, 2**22, 2**32])
+def test_argsort_is_stable(highest):
+    keys = np.random.default_rng(0).integers(0, highest, 1000, dtype=np.uint32)
+    np.testing.assert_array_equal(argsort(keys), np.argsort(keys, kind="stable"))
