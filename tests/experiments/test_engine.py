@@ -17,6 +17,7 @@ from experiments.engine import Setup
 from experiments.figures import FIGURES
 from experiments.store import Record, Store, read
 from gasil_jax.errors import InputError
+from gasil_jax.host import interruption
 from gasil_jax.host.members import Members
 from gasil_jax.host.runs import Run
 
@@ -200,6 +201,7 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
         status = __main__.main([*command, "--processes", "2"])
     assert status == 128 + signal.SIGTERM
     assert capsys.readouterr().err.splitlines() == [
+        interruption.ANSWER,
         engine._ENDING,
         "interrupted by SIGTERM; all that was done is saved",
         "continue with: the same command and --resume",

@@ -2,12 +2,10 @@
 
 import collections
 
-import jax
 import numpy as np
 import pytest
 
-import gasil_jax
-from experiments import doing_nothing, search
+from experiments import search
 from experiments.search import (
     AGENTS,
     SPACES,
@@ -137,16 +135,3 @@ def test_the_best_of_two_seeds_is_chosen_under_the_papers_protocol(tmp_path):
     fill(store, one, one.points(store), [1.0, 3.0, 2.0, 0.0])
     assert one.chosen(store) == {"learning_rate": 5e-5}
     assert not store.missing(one.requested(store)) and raw.chosen(store) is None
-
-
-def test_zero_actions_are_measured_like_a_policy():
-    env = gasil_jax.make_env("point_mass")
-    returned = doing_nothing.measure(env, jax.random.key(0), 8)
-    assert returned.low <= returned.mean <= returned.high
-    assert returned == doing_nothing.measure(env, jax.random.key(0), 8)
-
-
-def test_each_task_of_the_paper_s_protocol_has_its_return():
-    assert [*doing_nothing.stored()] == [*TASKS[:5]]
-    # An ant that stands still is paid 1 a step.
-    assert doing_nothing.stored()["ant"].low > 900
