@@ -38,8 +38,9 @@ gc.set_threshold(100_000, 20, 20)
 # Compiling takes most of the time, so most of XLA's optimizations are turned off. Tests
 # with this mark check XLA's numbers or its memory, and are compiled as for users.
 _AS_FOR_USERS = "compiled_as_for_users"
-# Modules with tests that take long by themselves.
-_LONG = {"test_examples", "test_figures", "test_ray", "test_readme", "test_sweep"}
+# Modules with tests that take long by themselves, or together on one worker.
+_LONG = {"test_examples", "test_figures", "test_fitting", "test_ray", "test_readme"}
+_LONG |= {"test_report", "test_resume", "test_sweep"}
 
 
 def pytest_configure(config):

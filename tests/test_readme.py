@@ -32,7 +32,7 @@ TRAINING = {
     "gasil_jax.run": options.Options,
     "gasil_jax.sweep": options.SweepOptions,
 }
-SMALL = FLAGS[2:]
+SMALL = ("--total-steps", "512", *FLAGS[4:])
 #: What stands for an option's value when a command is run.
 TOY = {
     "--env": "point_mass",

@@ -54,11 +54,13 @@ def test_an_optimized_iteration_equals_a_plain_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
     env = gasil_jax.make_env("point_mass", reward_delay=2, max_episode_steps=2)
     step = lambda state: gasil_jax.train_step(env, ALGORITHM, state)
-    first = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))(jax.random.key(0))
-    lowered = jax.jit(step).lower(first)
     # As tests are compiled that have no mark; see conftest.py.
     less = {"backend_optimization_level": 0, "llvm_disable_expensive_passes": True}
-    plain = lowered.compile({f"xla_{name}": value for name, value in less.items()})
+    less = {f"xla_{name}": value for name, value in less.items()}
+    init = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))
+    first = init.lower(jax.random.key(0)).compile(less)(jax.random.key(0))
+    lowered = jax.jit(step).lower(first)
+    plain = lowered.compile(less)
     optimized = lowered.compile()
     state, _ = plain(first)
     assert int(state.agent.buffer.size) == 3
