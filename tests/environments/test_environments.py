@@ -107,6 +107,11 @@ def test_one_step_equals_gymnasiums(name, physics):
     error = np.abs(state.obs - observation) / (1.0 + np.abs(observation))
     error = error.max(axis=1)  # the worst entry of each step
     reward_error = np.abs(state.reward - reward) / (1.0 + np.abs(reward))
+    quantiles = (0.5, 0.9, 0.99, 1.0)
+    show = lambda x: np.array2string(np.quantile(x, quantiles), precision=1)
+    print(f"{name}, {physics}: quantiles {quantiles} of the relative error of one step")
+    print("  observation", show(error))
+    print("  reward", show(reward_error))
     assert np.median(error) < 1e-5
     assert np.quantile(error, 0.9) < 1e-3
     assert np.median(reward_error) < 1e-5
@@ -150,7 +155,8 @@ def test_episodes_start_where_gymnasiums_do(name):
             error = np.abs(quantity(our, axis=0) - quantity(their, axis=0))
             # Some entries are the same in all episodes: there no error is allowed.
             error = error / np.maximum(their.std(axis=0), 1e-9)
-            assert error.max() < most, (field, of, error.max(), error.argmax())
+            print(f"{name}, {field}: {of} differs by {error.max():.2f} deviations")
+            assert error.max() < most, (field, of, error.argmax())
 
 
 def test_point_mass_against_a_plain_python_twin():
