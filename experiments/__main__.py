@@ -12,7 +12,6 @@ from typing import Any
 
 from experiments import (
     benchmark,
-    doing_nothing,
     engine,
     profile,
     report,
@@ -36,7 +35,6 @@ COMMANDS: Mapping[str, ModuleType] = {
     "benchmark": benchmark,
     "profile": profile,
     "zoo": zoo,
-    "doing_nothing": doing_nothing,
 }
 #: Environment steps of each run of `--quick`.
 _QUICK_STEPS = 100_000
