@@ -196,7 +196,8 @@ class Figure:
     def compared(self) -> Comparisons:
         """Return all comparisons of the figure."""
         if self.comparisons is not None:
-            return self.comparisons
+            every, own = self.comparisons.items(), self.panels.keys()
+            return {x: terms for x, terms in every if own >= {p for _, p, _ in terms}}
         compared: dict[tuple[str, ...], Terms] = {}
         for panel, curves in self.panels.items():
             pairs = self.pairs or [

@@ -185,7 +185,7 @@ def _draw_whole(
         axes.plot([low, high], [row, row], color=color, linewidth=width)
         axes.plot(middle, row, "o", color=color, markersize=4)
     axes.tick_params(axis="x", labelsize=7)
-    unit = "share of seeds" if figure.solved_from else "score"
+    unit = "share of seeds" if figure.solved_from else "score, 1: the best agent's"
     axes.set_xlabel(unit, fontsize=8)
 
 
