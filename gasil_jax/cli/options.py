@@ -5,7 +5,7 @@ import dataclasses
 import importlib
 import pathlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from gasil_jax import algorithms, presets
@@ -147,13 +147,24 @@ def read(
         if not first.config.is_file():
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
-    algorithm, default = _defaults(kind, first, stored, origin)
+    known: dict[str, Any] = {"env": dataclasses.MISSING, "preset": first.preset}
+    if stored is None:
+        with input_checked():
+            algorithm = _default(first)
+    else:
+        _refuse_others(first, stored, origin)
+        algorithm, seeds = stored.algorithm, stored.seeds
+        known = {"env": stored.env, "preset": stored.preset, "seeds": len(seeds)}
+        known["first_seed"] = seeds[0]
+    known |= {"agent": algorithm.agent.name, **_switches(algorithm)}
+    known["preset"] = known["preset"] or presets.DEFAULT
+    known["rewards"] = tuple(x.name for x in algorithm.own_models)
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
-    parser.add_fields(kind, "run", default)
+    parser.add_fields(kind, "run", kind(**known))
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
     _add_algorithm(parser, algorithm)
-    values = parser.read(words, _why_not(algorithm))
+    values = parser.read(words, algorithm.why_not)
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(words)}
     # A model of rewards that is off has options too.
@@ -203,40 +214,19 @@ def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namesp
     return parser.parse_known_args(words)[0]
 
 
-def _defaults(
-    kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
-) -> tuple[Algorithm, Options]:
-    """Return the algorithm and the options that hold where none are given."""
-    if stored is not None:
-        own_models = tuple(x.name for x in stored.algorithm.own_models)
-        for name, given, own in (
-            ("agent", first.agent, stored.algorithm.agent.name),
-            ("preset", first.preset, stored.preset),
-            ("rewards", first.rewards, own_models),
-        ):
-            if given not in (None, own):
-                raise InputError(
-                    f"{origin}, where {name} was {own}, is {given}: leave it "
-                    "out or name another one"
-                )
-        return stored.algorithm, kind(
-            env=stored.env,
-            agent=stored.algorithm.agent.name,
-            preset=stored.preset or presets.DEFAULT,
-            seeds=len(stored.seeds),
-            first_seed=stored.seeds[0],
-            rewards=own_models,
-            **_switches(stored.algorithm),
-        )
-    with input_checked():
-        algorithm = _default(first)
-    missing: Any = dataclasses.MISSING
-    return algorithm, kind(
-        env=missing,
-        agent=algorithm.agent.name,
-        preset=first.preset or presets.DEFAULT,
-        **_switches(algorithm),
-    )
+def _refuse_others(first: argparse.Namespace, stored: Sweep, origin: str) -> None:
+    """Raise `InputError` if a command line names another agent than a folder has."""
+    own_models = tuple(x.name for x in stored.algorithm.own_models)
+    for name, given, own in (
+        ("agent", first.agent, stored.algorithm.agent.name),
+        ("preset", first.preset, stored.preset),
+        ("rewards", first.rewards, own_models),
+    ):
+        if given not in (None, own):
+            raise InputError(
+                f"{origin}, where {name} was {own}, is {given}: leave it out or name "
+                "another one"
+            )
 
 
 def _default(first: argparse.Namespace) -> Algorithm:
@@ -255,14 +245,6 @@ def _default(first: argparse.Namespace) -> Algorithm:
     models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
     algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
     algorithms.check(algorithm)
-    taken = {*names(SweepOptions), *names(Settings)}
-    parts: tuple[Any, ...] = (algorithm.agent, *models)
-    for part in parts:
-        for setting in taken.intersection(names(part)):
-            raise InputError(
-                f"{part.name!r} has a setting {setting!r}, a name that is taken by an "
-                "option: it must be a new one"
-            )
     return algorithm
 
 
@@ -281,14 +263,6 @@ def _action_size(env: str, agent: str, preset: str) -> int | None:
     if environments.is_discrete(built):
         return presets.DISCRETE_SIZE
     return int(built.action_size)
-
-
-def _why_not(algorithm: Algorithm) -> Callable[[str], str | None]:
-    def why_not(name: str) -> str | None:
-        why = algorithm.why_not(name)
-        return why if " is a setting of " in why else None
-
-    return why_not
 
 
 def _seeds(options: Options, stored: Sweep | None) -> Sequence[int]:

@@ -72,8 +72,11 @@ class Parser(argparse.ArgumentParser):
             value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
-            if field.name in self._names:  # Two agents may share a setting.
-                continue
+            if field.name in self._names:
+                raise InputError(
+                    f"{title} has a setting {field.name!r}, a name that is taken by an "
+                    "option: it must be a new one"
+                )
             own.append(field.name)
             if field.metadata.get("positional"):
                 of_type = _of_type(hints[field.name]) | {"metavar": field.name.upper()}
@@ -96,7 +99,7 @@ class Parser(argparse.ArgumentParser):
     def read(
         self,
         given: Sequence[str],
-        why_not: Callable[[str], str | None] = lambda name: None,
+        why_not: Callable[[str], str] = lambda name: "",
     ) -> argparse.Namespace:
         """Return the values of the words of a command line."""
         if "--version" in given:
@@ -113,7 +116,8 @@ class Parser(argparse.ArgumentParser):
             name = flag.removeprefix("--").replace("-", "_")
             if not flag.startswith("--"):
                 raise InputError(f"{word!r} is not an option or its value: see --help")
-            if (why := why_not(name.removeprefix("no_"))) is not None:
+            # Of another agent.
+            if " is a setting of " in (why := why_not(name.removeprefix("no_"))):
                 raise InputError(f"option {flag} is unknown: {why}")
             near = nearest(name.removeprefix("no_"), self._names)
             meant = f"did you mean --{near.replace('_', '-')}?" if near else ""

@@ -262,7 +262,7 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
     again = ["--resume", "--out", "out", "--rewards", "my_models:Wrong0"]
     told = refused(capsys, run, *again)
-    assert "rewards was ['my_models:Signs'], is ['my_mod" in told
+    assert "rewards was ('my_models:Signs',), is ('my_mod" in told
 
 
 @pytest.mark.parametrize(

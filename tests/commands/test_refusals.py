@@ -60,10 +60,10 @@ hopper --log tensorboard tensorboard | log has 'tensorboard' twice: name it once
 hopper --resume=3 | resume: ignored explicit argument '3'
 hopper ant | 'ant' is not an option or its value: see --help
 mass --max-episode-steps 51 | from 1 to 50, the environment's
-mass --evaluate-every 0 | evaluate_every is 0: it must be from 1
-mass --video-every 0 | video_every is 0: it must be from 1
+mass --evaluate-every 0 | evaluate_every is 0: it must be a whole number, 1
+mass --video-every 0 | video_every is 0: it must be a whole number, 1
 mass --evaluate-episodes 3 | evaluate_episodes is 3: it needs evaluate_every
-mass --evaluate-every 9 --evaluate-episodes 1e12 | GB of memory
+mass --evaluate-every 9 --evaluate-episodes 2e9 | GB of memory
 mass --out LONGx | too long
 mass --alpha LONGx | alpha is 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx
 mass --agent gail | expert is missing
