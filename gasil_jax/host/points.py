@@ -11,7 +11,7 @@ from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.algorithms import check as check_algorithm
 from gasil_jax.config import names, ranges
-from gasil_jax.errors import InputError, did_you_mean, refusal
+from gasil_jax.errors import InputError, did_you_mean
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -93,11 +93,9 @@ def check(every: Iterable[Point], algorithm: Algorithm, *, source: str = "") -> 
     allowed, unused = _kinds(algorithm), without_effect(algorithm)
     try:
         for values in every:
-            for name, value in values.items():
+            for name in values:
                 if name not in allowed:
                     raise InputError(_why_not(name, algorithm))
-                if value is None:
-                    raise refusal(name, value, "a number")
                 if name in unused:
                     raise InputError(f"{name} can't vary: {unused[name]}")
             check_algorithm(algorithm.replace(**values))
