@@ -44,7 +44,8 @@ ACTION_SIZES = {
     "reacher": 2,
     "pusher": 7,
 }
-#: The agents that follow the rule "scaled", in any environment; by default the last.
+#: The agents that follow the rule "scaled", in any environment; by default the last,
+#: which also has an entropy bonus.
 RULED = ("ppo", "ppo+novelty", "ppo+gasil+novelty")
 #: The dimension that discrete actions count as, in that rule.
 DISCRETE_SIZE = 2
@@ -92,20 +93,31 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     (docs/results/ablations.md): with more dimensions the searches chose a smaller
     learning rate and less exploration, and noise makes returns vary more.
     """
-    share = min(max((action_size - 2) / 6, 0.0), 1.0)
-
-    def between(two: float, eight: float) -> float:
-        return two * (1 - share) + eight * share
-
     return {
         "normalize_rewards": True,
         "decompose_rewards": decompose_rewards,
         "num_envs": 32,
         "gamma": 0.995,
-        "learning_rate": between(7.5e-4, 1e-4),
-        "initial_std": between(0.7, 0.25),
-        "gae_lambda": between(0.975, 0.9),
+        "learning_rate": _between(7.5e-4, 1e-4, action_size),
+        "initial_std": _between(0.7, 0.25, action_size),
+        "gae_lambda": _between(0.975, 0.9, action_size),
     }
+
+
+def scaled_with_entropy(action_size: int, decompose_rewards: bool) -> Overrides:
+    """Return the same with an entropy bonus, the rule of PPO+GASIL+NOVELTY.
+
+    It too falls linearly: from eight dimensions on there is none.
+    """
+    entropy = _between(0.01, 0.0, action_size)
+    row = scaled(action_size, decompose_rewards)
+    return {**row, "entropy_coefficient": entropy}
+
+
+def _between(two: float, eight: float, action_size: int) -> float:
+    """Return a value on the line from two dimensions to eight, and beyond its end."""
+    share = min(max((action_size - 2) / 6, 0.0), 1.0)
+    return two * (1 - share) + eight * share
 
 
 def is_ruled(agent: str, name: str) -> bool:
@@ -201,7 +213,8 @@ def preset(
                 f"action_size is None: preset {name!r} needs the dimension of {env}'s "
                 "actions, which is env.action_size, or 2 if they are discrete"
             )
-        row = scaled(size, decompose_rewards=reward_delay > 1)
+        rule = scaled_with_entropy if kind.name == RULED[-1] else scaled
+        row = rule(size, reward_delay > 1)
         return Algorithm(kind()).replace(**row)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and name != DEFAULT:

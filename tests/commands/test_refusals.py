@@ -91,11 +91,11 @@ shard --shard 1/2 | 1 runs (points x seeds) make 1
 shard --launcher ray | None: --launcher needs --shards
 shard --launcher ray --shards 2 | make 1 shards
 figure nonsense | experiment 'nonsense' is unknown: it must be one of
-figure matrix --shard 3/2 | --shard: invalid shard value: '3/2'
-figure matrix --devices 0 | --devices: 0: it must be 1 or more
+figure matrix --shard 3/2 | shard is '3/2': it must be NUMBER/COUNT
+figure matrix --devices 0 | devices is 0: it must be from 1 to
 figure matrix --quick --results x | results is x: --quick writes below
-figure report --help-me | unrecognized arguments: --help-me
-figure benchmark --tables speed | --tables: invalid choice: 'speed' (ch
+figure report --help-me | option --help-me is unknown: see --help
+figure benchmark --tables speed | tables is 'speed': it must be one of physics, training
 figure benchmark --repeats 9 --page | page is set, but
 evaluate | RUN is missing: see --help
 evaluate zoo:walker --gymnasium | policy of the zoo 'walker' is unknown: did
