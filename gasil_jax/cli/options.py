@@ -22,6 +22,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
+    start,
     sweep,
 )
 from gasil_jax.host.environments import Settings
@@ -70,6 +71,8 @@ class Options:
         log may differ. If the folder holds nothing yet, training begins.
       config: the config.json of another run: what it holds is used for all options that
         are not given.
+      init_from: folder of a run, whose best seed's policy, values and normalizer of
+        observations training starts from, instead of new ones.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -90,6 +93,7 @@ class Options:
     out: pathlib.Path | None = None
     resume: bool = False
     config: pathlib.Path | None = None
+    init_from: pathlib.Path | None = None
     devices: int | None = None
     rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
@@ -180,7 +184,10 @@ def read(
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
+        start=None if stored is None else stored.start,
     )
+    if options.init_from is not None:
+        requested = dataclasses.replace(requested, start=start.find(options.init_from))
     _check(options, requested)
     if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
         raise InputError(

@@ -25,7 +25,8 @@ _WAYS = ("physics",)
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The physics engine and the device are not among them, because they compute the same
+    `start` is the hash of the policy that it starts from, if that is a trained one. The
+    physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -34,6 +35,7 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
+    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -60,6 +62,7 @@ class Run:
             settings[name] = float(settings[name])
         return {
             "env": self.env,
+            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": values,

@@ -79,6 +79,15 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True)
+class Start:
+    """The trained policy that runs start from."""
+
+    run: str  # the folder of its run
+    seed: int
+    sha256: str  # hash of its checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
 class Sweep:
     """The points and seeds of a folder."""
 
@@ -93,13 +102,16 @@ class Sweep:
     # Why no command line can make the environment or the algorithm again; None if one
     # can.
     only_python: str | None = None
+    # The trained policy that all runs start from; None starts from scratch.
+    start: Start | None = None
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
         """The run of each (index of the point, seed)."""
         changed = [self.algorithm.replace(**values) for values in self.points]
+        start = None if self.start is None else self.start.sha256
         return {
-            (index, seed): Run(self.env, algorithm, seed, self.settings)
+            (index, seed): Run(self.env, algorithm, seed, self.settings, start=start)
             for index, algorithm in enumerate(changed)
             for seed in self.seeds
         }
@@ -161,6 +173,7 @@ class Sweep:
             "seeds": list(self.seeds),
             "recording": self.recording,
             "preset": self.preset,
+            "start": self.start,
             "only_python": self.only_python,
             "expert_sha256": _expert_hash(self),
         }
@@ -193,7 +206,7 @@ class Sweep:
                 "video_every, devices and log may differ"
             )
         every = points.completed([*stored["points"], *self.points], self.algorithm)
-        return dataclasses.replace(self, points=every)
+        return dataclasses.replace(self, points=every, start=stored.get("start"))
 
 
 class Config(TypedDict, total=False):
@@ -207,6 +220,7 @@ class Config(TypedDict, total=False):
     recording: Required[Recording]
     preset: Required[str | None]
     only_python: Required[str | None]
+    start: Start | None
     expert_sha256: str | None
 
 
@@ -251,7 +265,8 @@ def made(
         every = points.completed(stored["points"], algorithm)
     names = ("env", "settings", "seeds", "recording", "preset", "only_python")
     fields: dict[str, Any] = {name: stored[name] for name in names}  # type: ignore[literal-required]
-    return Sweep(algorithm=algorithm, points=every, **fields)
+    start = stored.get("start")
+    return Sweep(algorithm=algorithm, points=every, start=start, **fields)
 
 
 def _note_imports(folder: pathlib.Path, stored: Config) -> None:
@@ -297,6 +312,9 @@ def _differences(before: Config, now: Sweep) -> list[str]:
         changes.append(f"total_steps was {old['total_steps']}")
     if not set(before["seeds"]) <= set(now.seeds):
         changes.append(f"seeds were {shown(list(before['seeds']))}")
+    start = before.get("start")
+    if now.start and (start is None or start.sha256 != now.start.sha256):
+        changes.append(f"init_from was {start and start.run}, is {now.start.run}")
     if before.get("expert_sha256") != _expert_hash(now):
         changes.append("the trajectories of the expert were others")
     return changes
