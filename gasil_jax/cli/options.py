@@ -56,7 +56,8 @@ class Options:
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
         MODULE:CLASS. Each has its own settings: this help shows those of the one that
-        is named beside it.
+        is named beside it. Several, separated by commas, are trained side by side, each
+        from its own preset: the points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -153,34 +154,36 @@ def read(
         stored = sweep.read(first.config)
     known: dict[str, Any] = {"env": dataclasses.MISSING, "preset": first.preset}
     if stored is None:
+        agents = (first.agent or Options.agent).split(",")
+        for name in agents:
+            if agents.count(name) > 1:
+                raise InputError(f"agent has {name!r} twice: name it once")
         with input_checked():
-            algorithm = _default(first)
+            every = [_default(name, first) for name in agents]
     else:
         _refuse_others(first, stored, origin)
-        algorithm, seeds = stored.algorithm, stored.seeds
+        every, seeds = [*stored.algorithms], stored.seeds
         known = {"env": stored.env, "preset": stored.preset, "seeds": len(seeds)}
         known["first_seed"] = seeds[0]
-    known |= {"agent": algorithm.agent.name, **_switches(algorithm)}
+    known["agent"] = ",".join(x.agent.name for x in every)
     known["preset"] = known["preset"] or presets.DEFAULT
-    known["rewards"] = tuple(x.name for x in algorithm.own_models)
+    known["rewards"] = tuple(x.name for x in every[0].own_models)
+    known |= _switches(every[0])
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", kind(**known))
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
-    _add_algorithm(parser, algorithm)
-    values = parser.read(words, algorithm.why_not)
+    _add_algorithms(parser, every)
+    values = parser.read(words, every[0].why_not)
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(words)}
-    # A model of rewards that is off has options too.
-    switches = {x: given[x] for x in _switches(algorithm) if x in given}
     with input_checked():
-        algorithm = algorithm.replace(**switches)
-        own = {x: value for x, value in given.items() if x in algorithm.settings}
-        algorithm = algorithm.replace(**own)
+        algorithm, *others = (_changed(each, given) for each in every)
     requested = Sweep(
         options.env,
         algorithm,
         _seeds(options, stored),
+        others=tuple(others),
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
@@ -200,8 +203,18 @@ def read(
     return options, requested
 
 
-def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
-    """Add an option for each setting."""
+def _changed(algorithm: Algorithm, given: Mapping[str, Any]) -> Algorithm:
+    """Return an algorithm with those of the given values that it has."""
+    # A model of rewards that is off has options too.
+    switches = {x: given[x] for x in _switches(algorithm) if x in given}
+    algorithm = algorithm.replace(**switches)
+    own = {x: value for x, value in given.items() if x in algorithm.settings}
+    return algorithm.replace(**own)
+
+
+def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
+    """Add an option for each setting; those of several agents have one."""
+    algorithm, *others = every
     agent, own = algorithm.agent, {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
@@ -209,6 +222,10 @@ def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
         parser.add_fields(model, model.switch, own.get(model, model()))
     for each in algorithm.own_models:
         parser.add_fields(type(each), each.name, each, all_shown=True)
+    shared = {*names(agent)}
+    for other in (x.agent for x in others):
+        parser.add_fields(type(other), other.name, other, shared=shared)
+        shared |= {*names(other)}
 
 
 def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namespace:
@@ -225,7 +242,7 @@ def _refuse_others(first: argparse.Namespace, stored: Sweep, origin: str) -> Non
     """Raise `InputError` if a command line names another agent than a folder has."""
     own_models = tuple(x.name for x in stored.algorithm.own_models)
     for name, given, own in (
-        ("agent", first.agent, stored.algorithm.agent.name),
+        ("agent", first.agent, stored.agent),
         ("preset", first.preset, stored.preset),
         ("rewards", first.rewards, own_models),
     ):
@@ -236,10 +253,9 @@ def _refuse_others(first: argparse.Namespace, stored: Sweep, origin: str) -> Non
             )
 
 
-def _default(first: argparse.Namespace) -> Algorithm:
+def _default(name: str, first: argparse.Namespace) -> Algorithm:
     """Return the algorithm from which an agent starts."""
-    agent = descriptions.find_agent(first.agent or Options.agent)
-    preset = first.preset or presets.DEFAULT
+    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
     algorithm = Algorithm(agent())
     if first.env is not None:
         algorithm = presets.preset(
@@ -296,17 +312,21 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
                 options.grid,
                 options.random,
                 seed=options.first_seed,
-                algorithm=requested.algorithm,
+                algorithms=requested.algorithms,
             )
-        elif stored is None:
+        elif stored is None and not requested.others:
             raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random"
+                "grid is empty: it must be NAME=VALUE,..., or use --random or several "
+                "agents"
             )
     if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
     named = named or [{}]
-    points.check(named, requested.algorithm)
-    every = points.completed(named, requested.algorithm)
+    if requested.others:
+        agents = [each.agent.name for each in requested.algorithms]
+        named = [{"agent": agent, **point} for agent in agents for point in named]
+    points.check(named, *requested.algorithms)
+    every = points.completed(named, *requested.algorithms)
     return dataclasses.replace(requested, points=every)
 
 
@@ -318,7 +338,8 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        algorithms.check(requested.algorithm)
+        for each in requested.algorithms:
+            algorithms.check(each)
         validate(requested.recording)
     check_minimum(options, devices=1)
     check_minimum(requested.settings, max_episode_steps=1)
@@ -344,19 +365,20 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
     """Print a note if the default preset has nothing for the agent and the task."""
-    lacking = presets.describe_lack(
-        options.env,
-        requested.algorithm.agent.name,
-        presets.DEFAULT,
-        reward_delay=requested.settings.reward_delay,
-    )
     default = options.preset == presets.DEFAULT
     default &= not options.resume and options.config is None
-    if default and lacking is not None:
+    for each in requested.algorithms if default else ():
+        lacking = presets.describe_lack(
+            options.env,
+            each.agent.name,
+            presets.DEFAULT,
+            reward_delay=requested.settings.reward_delay,
+        )
         more = ""
         if environments.is_discrete(env):
             more = " (--preset gymnax has one setting for discrete actions)"
-        note(f"{lacking}: options that are not given have their defaults{more}")
+        if lacking is not None:
+            note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

@@ -62,9 +62,18 @@ class Parser(argparse.ArgumentParser):
         raise InputError(message.replace("\n", " "))
 
     def add_fields(
-        self, kind: Any, title: str, default: Any = None, *, all_shown: bool = False
+        self,
+        kind: Any,
+        title: str,
+        default: Any = None,
+        *,
+        all_shown: bool = False,
+        shared: Collection[str] = (),
     ) -> None:
-        """Add an option for each field of a dataclass, as a group of the help."""
+        """Add an option for each field of a dataclass, as a group of the help.
+
+        Those that are `shared` with others have an option already.
+        """
         group = self.add_argument_group(title)
         texts, hints = _texts(kind), get_type_hints(kind)
         own = self._of[title] = []
@@ -72,6 +81,8 @@ class Parser(argparse.ArgumentParser):
             value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
+            if field.name in shared:
+                continue
             if field.name in self._names:
                 raise InputError(
                     f"{title} has a setting {field.name!r}, a name that is taken by an "

@@ -57,7 +57,7 @@ def train(
                 env,
                 needed,
                 requested.recording,
-                title=f"{requested.env} {requested.algorithm.agent.name}",
+                title=f"{requested.env} {requested.agent}",
                 interruption=interruption,
             )
         trained = requested.trained(folder)

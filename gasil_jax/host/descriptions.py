@@ -66,7 +66,10 @@ def _find(kind: str, name: Any, base: Any) -> Any:
 def describe(algorithm: Algorithm) -> dict[str, Any]:
     """Return the names of the agent and of one's own models, and every setting."""
     own = tuple(model.name for model in algorithm.own_models)
-    return {"agent": algorithm.agent.name, "rewards": own, **algorithm.settings}
+    values = {
+        x: "a function" if callable(y) else y for x, y in algorithm.settings.items()
+    }
+    return {"agent": algorithm.agent.name, "rewards": own, **values}
 
 
 def read(values: Mapping[str, Any]) -> Algorithm:

@@ -48,9 +48,7 @@ class Run:
         """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
         for name, value in values.items():
-            if callable(value):
-                values[name] = "a function"
-            elif name.endswith("_schedule"):
+            if name.endswith("_schedule") and value != "a function":
                 values[name] = [[float(x) for x in point] for point in value]
         # 1 and 1.0 are the same number, and so the same run.
         for part in self.algorithm.parts:

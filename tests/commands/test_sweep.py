@@ -2,6 +2,7 @@
 
 import json
 import os
+import pathlib
 import re
 import signal
 
@@ -11,13 +12,15 @@ import pytest
 from refusals import refused, rows
 from small_training import FLAGS, table
 
-from gasil_jax import sweep
+import gasil_jax
+from gasil_jax import plot, run, sweep
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
 from gasil_jax.host import points, saved, training
 from gasil_jax.host.members import Members
 from gasil_jax.host.points import PAPER_RANGES
+from gasil_jax.host.sweep import read as read_sweep
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -210,3 +213,39 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     # The first program was finished, and is left as it was.
     assert (first / "training.json").read_bytes() == seconds
+
+
+def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
+    own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")
+    assert run.main([*FLAGS, *agents, *own, "--out", "out"]) == 0
+    rows = table("out/results.csv")
+    assert [row["agent"] for row in rows] == ["ppo", "ppo+sil"]
+    stored = read_sweep(pathlib.Path("out"))
+    # Each has its own preset, and of what is given what it has.
+    for each in stored.algorithms:
+        preset = gasil_jax.preset("point_mass", each.agent.name)
+        same = "learning_rate", "gae_lambda"
+        assert [each.settings[x] for x in same] == [preset.settings[x] for x in same]
+        assert each.settings["gamma"] == 0.9
+    assert stored.others[0].settings["sil_coefficient"] == 0.3
+    # What only one of them measures is not known of the other.
+    curves = np.load("out/curves.npz")
+    only = [x for x in curves.files if np.isnan(curves[x][0]).all()]
+    assert only and np.isfinite(curves["policy_loss"]).all()
+    # They grow by points, in the same programs.
+    assert sweep.main(["--resume", "--out", "out", "--grid", "gamma=0.8"]) == 0
+    assert len(read_sweep(pathlib.Path("out")).points) == 4
+    assert plot.main(["out", "--out", "x.png"]) == 0
+    told = capsys.readouterr()
+    assert "point_mass, ppo " in told.out and "point_mass, ppo+sil " in told.out
+    for words, why in (
+        (("--agent", "ppo,ppo"), "agent has 'ppo' twice"),
+        (("--resume", "--agent", "ppo"), "agent was ppo,ppo+sil, is ppo"),
+        (("--agent", "ppo,gail", "--grid", "gamma=1", "agent=x"), "as --agent A,B"),
+        (("--agent", "ppo,gasil", "--grid", "alpha=1"), "not of ppo. What can vary"),
+    ):
+        out = "out" if "--resume" in words else "new"
+        assert sweep.main([*FLAGS, *words, "--out", out]) == 2
+        assert why in capsys.readouterr().err
