@@ -1,7 +1,6 @@
 """Train the members of a program in chunks; log, save and evaluate them in between.
 
-`drive` writes metrics.csv, checkpoints/ and, if policies are evaluated during training,
-evaluations.csv. A checkpoint records the number of rows of the two tables. Training
+A checkpoint records the number of rows of metrics.csv and evaluations.csv. Training
 that continues from it cuts the tables to these rows and writes the later ones again.
 """
 

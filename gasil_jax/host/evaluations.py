@@ -1,9 +1,4 @@
-"""Evaluate the policies of all members at regular intervals during training.
-
-The scores go to evaluations.csv, beside metrics.csv: a row for each member and
-evaluation, with the mean, lowest and highest return of its episodes and their mean
-length. Evaluations do not change training, not by a single bit.
-"""
+"""Evaluate the policies of all members at regular intervals during training."""
 
 import time
 from collections.abc import Sequence
@@ -31,13 +26,7 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
 
 
 class Evaluation:
-    """Evaluates all members with one compiled program, sharded as training is.
-
-    Attributes:
-      table: writes evaluations.csv.
-      interval: when to evaluate, beside the untrained and the final policy.
-      seconds: time of all evaluations in this process, including compilation.
-    """
+    """Evaluates all members with one compiled program, sharded as training is."""
 
     #: Columns of evaluations.csv after those that identify the members.
     COLUMNS = ("env_steps", "mean", "min", "max", "length")

@@ -19,11 +19,9 @@ from gasil_jax.host.sweep import Start
 
 def find(folder: pathlib.Path) -> Start:
     """Return the policy of a run's best seed, in its newest checkpoint."""
-    stored = sweep.read(folder)
     point, seed = saved.best_of(folder, None)
-    every = saved.programs_of(folder, stored, point)
-    if seed is None:
-        seed = every[0].seeds[0]
+    every = saved.programs_of(folder, sweep.read(folder), point)
+    seed = every[0].seeds[0] if seed is None else seed
     (path,) = (x.path for x in every if seed in x.seeds)
     newest, _ = checkpoint.latest(path / "checkpoints")
     if newest is None:
@@ -58,31 +56,26 @@ def load(start: Start, env: Any, every: Sequence[Program]) -> Any:
 
 
 def begin(trained: Any, env: Any, every: Sequence[Program]) -> None:
-    """Write a first checkpoint, with a trained policy, in programs that have none.
-
-    The networks' parameters and the normalizer of observations are the trained ones;
-    all else, such as optimizers, buffers and discriminators, is as in a new run.
-    """
+    """Write a first checkpoint, with a trained policy, in programs that have none."""
 
     def spread(new: Any, old: Any) -> Any:
         return jax.tree.map(lambda x, y: jnp.broadcast_to(y, x.shape), new, old)
+
+    def learned(new: Any, old: Any) -> Any:
+        return new.replace(params=spread(new.params, old.params))
 
     old = trained.actor_critic
     for each in _without_checkpoint(every):
         own = make_members(env, each.algorithm, each.seeds, each.hyperparameters)
         states = own.trim(own.init())
-        now = states.actor_critic
-        policy, values = spread(now.policy.params, old.policy.params), now.values
+        # All else, such as optimizers and buffers, is as in a new run.
+        now, values = states.actor_critic, states.actor_critic.values
         # Another agent may have more streams of rewards, each with its values.
         if len(values) == len(old.values):
-            values = tuple(
-                x.replace(params=spread(x.params, y.params))
-                for x, y in zip(values, old.values)
-            )
+            values = tuple(map(learned, values, old.values))
+        policy = learned(now.policy, old.policy)
         states = states.replace(
-            actor_critic=now.replace(
-                policy=now.policy.replace(params=policy), values=values
-            ),
+            actor_critic=now.replace(policy=policy, values=values),
             normalizer=spread(states.normalizer, trained.normalizer),
         )
         record = checkpoint.Record(metrics_rows=0, evaluations_rows=0, score=None)
