@@ -80,12 +80,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     agent = find_agent(settings.pop("agent"))
     own = json_files.as_type(tuple[str, ...], settings.pop("rewards", ()), "rewards")
     algorithm = Algorithm(agent(), tuple(find_model(name)() for name in own))
-    switches = {
-        model.switch: json_files.as_type(
-            bool, settings.pop(model.switch, False), model.switch
-        )
-        for model in REWARD_MODELS
-    }
+    switches = {x.switch: settings.pop(x.switch, False) for x in REWARD_MODELS}
     algorithm = algorithm.replace(**switches)
     kinds: dict[str, Any] = {}
     for part in algorithm.parts:
