@@ -109,6 +109,8 @@ class SweepOptions(Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: number of points to draw from the grid or, without a grid, from the
         ranges of the paper's appendix. The draw's seed is first_seed.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
+        instead of grid and random.
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
         from 1 on. Other processes train the others in the same folder. With --resume it
         continues.
@@ -118,6 +120,7 @@ class SweepOptions(Options):
 
     grid: tuple[str, ...] = ()
     random: int | None = None
+    points_file: pathlib.Path | None = None
     shard: str | None = None
     launcher: Literal["ray"] | None = None
     shards: int | None = None
@@ -307,7 +310,11 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
     """Return the sweep with the points that the options name."""
     named: Sequence[points.Point] | None = None
     if isinstance(options, SweepOptions):
-        if options.grid or options.random is not None:
+        if options.points_file is not None:
+            if options.grid or options.random is not None:
+                raise InputError("points_file can't be combined with grid or random")
+            named = points.read(options.points_file)
+        elif options.grid or options.random is not None:
             named = points.make_points(
                 options.grid,
                 options.random,
@@ -316,8 +323,8 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
             )
         elif stored is None and not requested.others:
             raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random or several "
-                "agents"
+                "grid is empty: it must be NAME=VALUE,..., or use --random, "
+                "--points-file or several agents"
             )
     if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)

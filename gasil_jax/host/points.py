@@ -1,10 +1,11 @@
-"""Make or draw the points of a sweep.
+"""Read, make or draw the points of a sweep.
 
 A point holds changed settings, by name; of a sweep over agents its "agent", too.
 """
 
 import itertools
 import math
+import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -15,6 +16,7 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.algorithms import check as check_algorithm
 from gasil_jax.config import names, ranges
 from gasil_jax.errors import InputError, did_you_mean, unknown
+from gasil_jax.host import json_files
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -147,6 +149,21 @@ def _why_not(name: str, algorithm: Algorithm) -> str:
     if name not in algorithm.settings and (name in of_models or agents_with(name)):
         return f"{algorithm.why_not(name)}. What can vary: {', '.join(allowed)}"
     return f"{name!r} can't vary: {did_you_mean(name, allowed)}"
+
+
+def read(path: pathlib.Path) -> list[Point]:
+    """Return the points that a JSON file lists."""
+    try:
+        every: Sequence[Point] = json_files.read(
+            path, tuple[dict[str, float | str], ...]
+        )
+    except OSError as error:
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
+    if not every:
+        raise InputError(f"points_file is {path}: it must list a point or more")
+    return list(every)
 
 
 def make_points(

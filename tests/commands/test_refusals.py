@@ -74,6 +74,7 @@ corridor --policy-components 4 | policy_components is 4: it must be 1, the
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
 sweep --random 3 --grid alpha=0.1,0.2,0.1 | it must be from 1 to 2, of 2 points
+sweep --points-file no.json | no.json, which can't be read
 grid alhpa=1 | did you mean 'alpha'
 grid alpha=1 --agent ppo | gail, not of ppo. What can vary: batch_steps
 grid buffer_steps=9 --agent ppo+sil | buffer_steps is a setting of ppo+bc, ppo+bc+n
@@ -82,6 +83,7 @@ grid num_envs=1,2 | 'num_envs' can't vary: it must be one of batch_steps
 grid alpha=1,big | it must be numbers, like alpha=0.1,0.2
 grid buffer_steps=1.5 | whole numbers, like buffer_steps=10,20
 grid alpha=0.02,0.1 alpha=0.2 | grid has alpha twice
+grid alpha=1 --points-file x | points_file can't be combined with grid
 grid policy_components=1,4 --env sparse:key_grid | policy_components is 4: it must be 1
 grid alpha=1 --shard 1/1 | shard needs --out
 grid alpha=1 --shards 3 | shards is 3: it needs --launcher

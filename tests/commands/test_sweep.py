@@ -57,6 +57,32 @@ def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
     assert points_of("--random", "4") == drawn[:4]
 
 
+def test_points_from_a_file(tmp_path):
+    path = tmp_path / "points.json"
+    path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
+    own = options_.read(SweepOptions, ["--env", "point_mass", "--random", "1"], "x")[1]
+    default = own.algorithm.settings
+    # A point that does not name a value has the sweep's own.
+    assert points_of("--points-file", str(path)) == [
+        {"alpha": 1.0, "buffer_steps": 500, "learning_rate": default["learning_rate"]},
+        {
+            "alpha": default["alpha"],
+            "buffer_steps": default["buffer_steps"],
+            "learning_rate": 1e-4,
+        },
+    ]
+    for text, message in (
+        ("[" * 100_000, "is damaged"),
+        ("[3]", "is damaged: its content is 3"),
+        ("[]", "it must list a point or more"),
+        ('[{"alhpa": 1}]', "did you mean 'alpha'"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            points_of("--points-file", str(path))
+
+
 def test_a_sweep_from_end_to_end(swept):
     out, told, printed = swept
     assert "x 8 runs" in told
@@ -142,6 +168,7 @@ GROWN = """
 --grid alpha=0.5 | --grid alpha=0.1 | 0.5, 0.1
 --grid alpha=0.5 gamma=0.9,0.98 | --grid alpha=0.5,2 | 0.5 0.9, 0.5 0.98, 2 0.98
 --grid alpha=0.5 | --grid gamma=0.9,0.98 alpha=0.5 | 0.5 0.98, 0.5 0.9
+--points-file a.json | --grid alpha=0.5 | 0.7, 0.5
 """
 
 
@@ -150,7 +177,11 @@ def test_a_sweep_continues_and_grows(
     before, more, expected, tmp_path, monkeypatch, planned
 ):
     monkeypatch.chdir(tmp_path)
+    file = tmp_path / "a.json"
+    file.write_text('[{"alpha": 0.7}]')
     again = begun(tmp_path / "s", *before.split())
+    # Its config.json has the points as well.
+    file.unlink()
     assert sweep.main([*again, *more.split()]) == 2
     ((requested, programs),) = planned
     points = [[float(x) for x in point.split()] for point in expected.split(",")]
