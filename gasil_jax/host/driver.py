@@ -22,8 +22,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint
 from gasil_jax.host.evaluations import Evaluation
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members
+from gasil_jax.host.members import Interval, Members
 from gasil_jax.host.output_file import note
 from gasil_jax.host.programs import Training
 from gasil_jax.host.progress import Progress

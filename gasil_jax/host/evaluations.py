@@ -8,8 +8,7 @@ import jax
 import numpy as np
 
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members
+from gasil_jax.host.members import Interval, Members
 from gasil_jax.host.tables import TableWriter
 from gasil_jax.host.trackers import Tracker
 from gasil_jax.train import TrainState

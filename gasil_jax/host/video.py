@@ -20,8 +20,7 @@ import numpy as np
 from gasil_envs import pictures, wrappers
 from gasil_jax import policy, rollout
 from gasil_jax.host import output_file
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members, member
+from gasil_jax.host.members import Interval, Members, member
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker
 
