@@ -205,7 +205,9 @@ def _of_type(hint: Any) -> dict[str, Any]:
             one["type"] = _number(whole_number, "whole numbers, separated by spaces")
         return {**one, "nargs": "*", "action": _Once}
     if get_origin(hint) is typing.Literal:
-        return {"choices": get_args(hint), "metavar": "|".join(get_args(hint))}
+        names = {name: name for name in get_args(hint)}
+        named = _number(names.__getitem__, f"one of {', '.join(names)}")
+        return {"type": named, "metavar": "|".join(names)}
     if hint is bool:
         return {"action": argparse.BooleanOptionalAction}
     if hint is int:
@@ -219,7 +221,7 @@ def _of_type(hint: Any) -> dict[str, Any]:
 
 def _number(kind: Callable[[str], Any], what: str) -> Callable[[str], Any]:
     def number(text: str) -> Any:
-        with contextlib.suppress(ValueError, OverflowError):
+        with contextlib.suppress(LookupError, ValueError, OverflowError):
             return kind(text)
         raise argparse.ArgumentTypeError(f"is {text!r}: it must be {what}")
 

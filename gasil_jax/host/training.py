@@ -45,8 +45,9 @@ def prepare(
         )
     with announced(sweep.env, "starting the devices"):
         visible = jax.devices()
-    for each in programs[:1]:
-        _check(env, each.algorithm)
+    algorithms = {x.algorithm.agent.name: x.algorithm for x in programs}
+    for each in algorithms.values():
+        _check(env, each)
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, visible)
     _note_if_no_episode_ends(env, [each.algorithm for each in programs])

@@ -113,7 +113,7 @@ resume --gamma 0.5 | gamma was 0.98, is 0.5: only total_steps and seeds
 resume --obs-noise 0.2 --num-epochs 3 | num_epochs was 2, is 3
 resume --seeds 2 | seeds were [5, 6, 7]: only total_steps and seeds may
 resume --evaluate-every 300 | evaluate_every was 512, is 300
-score --checkpoint first | checkpoint: invalid choice: 'first' (choose from
+score --checkpoint first | checkpoint is 'first': it must be one of last, be
 score --episodes 1000000000000 | GB of memory
 score --seed 8 | seed is 8: the run has 5, 6, 7
 score --point 1 | point is 1: 
