@@ -202,7 +202,6 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
     assert status == 128 + signal.SIGTERM
     assert capsys.readouterr().err.splitlines() == [
         interruption.ANSWER,
-        engine._ENDING,
         "interrupted by SIGTERM; all that was done is saved",
         "continue with: the same command and --resume",
     ]
