@@ -45,16 +45,9 @@ def make(delay=1, **arguments):
 def collect(env, num_envs, num_steps):
     environments = rollout.init(env, jax.random.key(1), num_envs, age_limit=LIMIT)
     policy = lambda observation: (jnp.zeros((num_envs, 1)), jnp.zeros(1))
-    batch = rollout.collect(
-        env,
-        policy,
-        environments,
-        jax.random.key(2),
-        distribution=GAUSSIAN,
-        num_steps=num_steps,
-        max_episode_steps=LIMIT,
-        gamma=1.0,
-    )[1]
+    sizes = {"num_steps": num_steps, "max_episode_steps": LIMIT}
+    given = env, policy, environments, jax.random.key(2)
+    _, batch = rollout.collect(*given, distribution=GAUSSIAN, **sizes, gamma=1.0)
     return np.asarray(environments.starting_age), batch
 
 

@@ -246,7 +246,7 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys, figures):
     assert (first / "training.json").read_bytes() == seconds
 
 
-def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
+def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys, figures):
     monkeypatch.chdir(tmp_path)
     agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
     own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")
