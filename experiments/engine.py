@@ -46,7 +46,6 @@ _WRITTEN = (
 #: The file of a scratch folder that says how each session trained.
 _SESSIONS = "provenance.json"
 _HOW_TO_CONTINUE = "continue with: the same command and --resume"
-_ENDING = "waiting until all processes have saved; Ctrl-C again quits now"
 _SECONDS_BETWEEN_POLLS = 1.0
 
 
@@ -270,7 +269,6 @@ def _train_on_core(core: int, stored: Program, setup: Setup, folder: Any) -> Non
 
 def _end(processes: Collection[Any]) -> None:
     """End processes, and wait until they have saved; a second Ctrl-C kills them."""
-    print(_ENDING, file=sys.stderr, flush=True)
     try:
         while alive := [x for x in processes if x.is_alive()]:
             for process in alive:
