@@ -123,7 +123,9 @@ class Constants(struct.PyTreeNode):
         moves the first and 0 where it moves both or none.
       body: (C, N, 1), 1 at the second body and -1 at the first, unless that is the
         world; 0 elsewhere.
-      friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes.
+      friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes;
+        of cones these divided by their ratio.
+      ratio: (C or 1, 1), that of elliptic cones, see `newton.Cone`; None of pyramids.
       margin: distance from which a contact is in play.
       inverse_weight: of an edge of the pyramid.
       least_resistance: of an edge, the inverse of its greatest weight.
@@ -133,6 +135,7 @@ class Constants(struct.PyTreeNode):
     chain: np.ndarray
     body: np.ndarray
     friction: np.ndarray
+    ratio: np.ndarray | None
     margin: np.ndarray
     inverse_weight: np.ndarray
     least_resistance: np.ndarray
@@ -219,10 +222,14 @@ class Contacts(NamedTuple):
     constants: Constants
 
 
+def _is_elliptic(model: mujoco.MjModel) -> bool:
+    return model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
+
+
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `layout` can't describe this model, or None if it can."""
-    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        return "its friction cones are elliptic"
+    if _is_elliptic(model) and model.pair_solreffriction.any():
+        return "it has pairs of geoms with solreffriction"
     allowed = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
     if not np.isin(model.eq_type[model.eq_active0.astype(bool)], allowed).all():
         return "it has equality constraints of bodies"
@@ -254,7 +261,8 @@ def layout(model: mujoco.MjModel) -> Layout:
     contact = candidates.candidates(model)
     normal = motion_normal(model, contact.geoms)
     round_geoms = model.geom_type[contact.geoms] <= int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-    if (contact.dim > 3).any() or not round_geoms.all():
+    anisotropic = (contact.friction[:, 0] != contact.friction[:, 1]).any()
+    if (contact.dim > 3).any() or not round_geoms.all() or anisotropic:
         normal = None
     groups = [
         _group(model, contact, dim, motion_normal=normal)
@@ -326,6 +334,10 @@ def _group(
 ) -> Group:
     flat = motion_normal is not None and condim == 3
     edges = _FLAT_PYRAMID if flat else _pyramid(condim)
+    elliptic = _is_elliptic(model) and condim > 1
+    if elliptic:
+        axes = np.eye(2 if flat else condim, dtype=int)
+        edges = tuple(tuple(map(int, axis)) for axis in axes)
     chosen = np.flatnonzero(contact.dim == condim)
     pairs, index = collision.pairs(
         model,
@@ -353,7 +365,15 @@ def _group(
     reach = model.geom_rbound[contact.geoms[index]]
     turned = (model.body_invweight0[body, 1] * reach**2).sum(axis=1)
     moved = np.where(inverse_weight < 1e-4 * turned, turned, inverse_weight)
-    if condim > 1:
+    ratio = None
+    if elliptic:
+        # The weight of sliding is `impratio` times that of touching.
+        scale = max(model.opt.impratio, mujoco.mjMINVAL)
+        moved = moved * max(scale, 1.0)
+        ratio = sliding / np.float32(np.sqrt(scale))
+        friction = friction / ratio[:, None]
+        ratio = _constant(ratio)
+    elif condim > 1:
         moved, inverse_weight = (x * (1 + sliding**2) for x in (moved, inverse_weight))
         inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
         floor = floor * 2 * sliding**2 / model.opt.impratio
@@ -370,6 +390,7 @@ def _group(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
         body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),
         friction=_constant(friction),
+        ratio=ratio,
         margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
         least_resistance=_constant(floor),
@@ -597,11 +618,17 @@ def contact_rows(
     count = [
         2.0 if edges == _FLAT_PYRAMID and signs == (1, 0) else 1.0 for signs in edges
     ]
+    cone = None
+    if constants.ratio is not None:
+        ratio = jnp.broadcast_to(jnp.asarray(constants.ratio), weight.shape)
+        count, cone = [1.0], newton.Cone(ratio[:, None])
+    damping = -constants.impedance.damping[:, None] * speed
     return newton.ContactRows(
         basis=along,
-        reference=-constants.impedance.damping[:, None] * speed - pull[:, None],
+        reference=damping - pull[:, None] * signs[:, 0],
         weight=weight[:, None] * np.array(count, np.float32)[:, None],
         edges=edges,
+        bound=cone,
     )
 
 
@@ -622,9 +649,10 @@ def body_forces(
       edge_forces: (C, E, B), force along each edge.
     """
     (_, position, axes), constants = contacts
-    force = total(edge_forces, 1)[:, None] * axes[:, 0]
+    normal, *tangents = np.array(edges, np.float32).T
+    force = total(edge_forces * normal[:, None], 1)[:, None] * axes[:, 0]
     turn = None
-    for t, signs in enumerate(np.array(edges, np.float32).T[1:], 1):
+    for t, signs in enumerate(tangents, 1):
         friction = constants.friction[
             :, 0 if constants.friction.shape[1] == 1 else t - 1
         ]

@@ -9,7 +9,8 @@ MuJoCo's constrained acceleration minimizes, over qacc,
 quadratic, so Newton's method with an exact line search ends as soon as it has found the
 active rows. Most rows are one-sided, as here: they only push. Those of dry friction and
 of equalities pull as well, with a force D_r (J_r qacc - aref_r) up to a bound, which is
-infinite for an equality; beyond it the cost is linear.
+infinite for an equality; beyond it the cost is linear. The rows of an elliptic cone are
+the axes of a contact, whose cost is one of all of them (see `Cone`).
 
 Rows are not stored one by one. A joint's is one entry of a diagonal. The rows
 of a contact are the edges of its friction pyramid, normal +- friction * tangent: with
@@ -27,7 +28,7 @@ dynamic.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -40,6 +41,23 @@ from gasil_envs.physics.batching import add, sum_signed
 # the shapes of one problem; in a batch every array has B as a further, last axis.
 
 
+class Cone(NamedTuple):
+    """Elliptic friction cones of contacts whose edges are their axes.
+
+    With y = J qacc - aref, whose tangents are scaled by friction / ratio, t the length
+    of the tangents of y, and u its normal, the cost of a contact is
+
+      D/2 (u^2 + t^2) where ratio u + t <= 0: friction holds it,
+      D/2 (u - ratio t)^2 / (1 + ratio^2) else, where u < ratio t: it slides,
+      0 where it does not touch.
+
+    Attributes:
+      ratio: (C, 1), the first friction / sqrt(impratio).
+    """
+
+    ratio: Any
+
+
 class ContactRows(struct.PyTreeNode):
     """The rows of a group of contacts with the same number of edges; float32.
 
@@ -47,16 +65,18 @@ class ContactRows(struct.PyTreeNode):
       basis: (C, A, V), Jacobians of the normal and of the tangents times the friction;
         zero where out of play.
       reference: (C, E), aref of the edges.
-      weight: (C, E), D of the edges; 0 where out of play and above 0 elsewhere.
+      weight: (C, E), D of the edges, (C, 1) of cones; 0 where out of play and above 0
+        elsewhere.
       edges: E rows of A signs: an edge is their product with the axes.
-      bound: (C, E), largest force of rows that push and pull; None if they only push.
+      bound: (C, E), largest force of rows that push and pull; None if they only push;
+        or the cones.
     """
 
     basis: jax.Array
     reference: jax.Array
     weight: jax.Array
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
-    bound: jax.Array | None = None
+    bound: jax.Array | Cone | None = None
 
 
 class JointRows(struct.PyTreeNode):
@@ -120,7 +140,7 @@ class System(Protocol):
       reference: rows, aref.
       weight: rows, D.
       bound: for each entry of the list of rows, None if these only push, or the largest
-        force of each.
+        force of each, or a `Cone`, whose rows are a list of axes.
     """
 
     force: Any
@@ -174,9 +194,13 @@ def weighted_axes(
 
     Args:
       edges: E rows of A signs, as in `ContactRows`.
-      weights: for each edge an array (C, ...).
+      weights: for each edge an array (C, ...); of cones A rows of A such arrays.
       axes: for each axis an array (C, V, ...), its rows of B.
     """
+    if isinstance(weights[0], list):
+        for row in weights:
+            yield add(x[:, None] * axis for x, axis in zip(row, axes, strict=True))
+        return
     signs = list(zip(*edges, strict=True))
     for own in signs:
         terms = []
@@ -225,6 +249,11 @@ def _rate(d: jax.Array, w: jax.Array, most: Any, slope: jax.Array) -> jax.Array:
     return _derivative(d, w, most) * slope
 
 
+def _bend(d: jax.Array, w: jax.Array, most: Any, slope: jax.Array) -> jax.Array:
+    """The second derivative of the cost along such a direction."""
+    return _curvature(d, w, most) * slope * slope
+
+
 def _piece(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     """Which piece of the cost: whether it pushes, or which of its bounds it is at."""
     if most is None:
@@ -232,6 +261,80 @@ def _piece(d: jax.Array, w: jax.Array, most: Any) -> jax.Array:
     force = w * d
     # One that is not a number is equal to itself, so that the iterations end.
     return jnp.where(jnp.abs(force) >= most, jnp.sign(force), 0.0)
+
+
+# The same of contacts with elliptic cones, from the list of a contact's axes.
+
+
+def _cone_parts(d: Any, w: jax.Array, ratio: jax.Array) -> tuple[jax.Array, ...]:
+    """Return what the others share.
+
+    The weight of sliding, 0 where it does not; the derivative by the normal; what the
+    tangents are multiplied with in theirs; the tangents' length; whether it is held.
+    """
+    normal, *tangents = d
+    length = jnp.sqrt(add(x * x for x in tangents))
+    held = ratio * normal + length <= 0.0
+    beyond = normal - ratio * length
+    sliding = w / (1.0 + ratio * ratio)
+    push = jnp.where(held, w * normal, sliding * jnp.minimum(beyond, 0.0))
+    length = jnp.maximum(length, 1e-15)
+    side = jnp.where(held, w, -push * ratio / length)
+    return jnp.where((beyond < 0.0) & ~held, sliding, 0.0), push, side, length, held
+
+
+def _cone_derivative(d: Any, w: jax.Array, ratio: jax.Array) -> list[jax.Array]:
+    _, push, side, *_ = _cone_parts(d, w, ratio)
+    return [push, *(side * x for x in d[1:])]
+
+
+def _cone_cost(d: Any, w: jax.Array, ratio: jax.Array) -> jax.Array:
+    # Of degree 2, as all three pieces are.
+    return add(x * y for x, y in zip(d, _cone_derivative(d, w, ratio), strict=True))
+
+
+def _cone_curvature(d: Any, w: jax.Array, ratio: jax.Array) -> list[list[jax.Array]]:
+    """The second derivatives by the normal and the tangents."""
+    sliding, _, side, length, held = _cone_parts(d, w, ratio)
+    # The cost bends along the normal less `ratio` times the tangents' direction.
+    along = [jnp.ones_like(length), *(-ratio * x / length for x in d[1:])]
+    # In their direction the tangents' own derivative does not change by `side`.
+    lost = jnp.where(held, 0.0, side / (ratio * ratio))
+    rows = [[sliding * x * y for y in along] for x in along]
+    for i, row in enumerate(rows):
+        row[i] = row[i] + (side if i else jnp.where(held, w, 0.0))
+        for j in range(1, len(row)) if i else ():
+            row[j] = row[j] - lost * along[i] * along[j]
+    return rows
+
+
+def _cone_rate(d: Any, w: jax.Array, ratio: jax.Array, slope: Any) -> jax.Array:
+    derivative = _cone_derivative(d, w, ratio)
+    return add(x * y for x, y in zip(derivative, slope, strict=True))
+
+
+def _cone_bend(d: Any, w: jax.Array, ratio: jax.Array, slope: Any) -> jax.Array:
+    sliding, _, side, length, held = _cone_parts(d, w, ratio)
+    along = add(x * y for x, y in zip(d[1:], slope[1:], strict=True)) / length
+    square = add(x * x for x in slope[1:]) - jnp.where(held, 0.0, along * along)
+    bent = sliding * (slope[0] - ratio * along) ** 2 + side * square
+    return bent + jnp.where(held, w * slope[0] ** 2, 0.0)
+
+
+def _cone_piece(d: Any, w: jax.Array, ratio: jax.Array) -> jax.Array:
+    sliding, *_, held = _cone_parts(d, w, ratio)
+    return jnp.where(held, 2.0, jnp.where(sliding > 0.0, 1.0, 0.0))
+
+
+_OF_CONES: dict[Any, Callable[..., Any]] = {
+    _cost: _cone_cost,
+    _derivative: _cone_derivative,
+    _force: lambda *x: [0.0 - y for y in _cone_derivative(*x)],
+    _curvature: _cone_curvature,
+    _rate: _cone_rate,
+    _bend: _cone_bend,
+    _piece: _cone_piece,
+}
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
@@ -243,19 +346,23 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
       line_search: largest number of steps of each line search.
     """
     each = jax.tree.map
+    has_cones = any(isinstance(most, Cone) for most in system.bound)
     # A row that bends twice can send a search from one end to the other for ever.
     pulls = any(most is not None for most in system.bound)
     thorough = pulls or line_search > 4
 
     def of_rows(function: Callable[..., jax.Array], jaref: Any, *others: Any) -> Any:
         """Return a function of each row; `others` are the last arguments."""
+
+        def of_one(d: Any, w: Any, most: Any, *x: Any) -> Any:
+            if isinstance(most, Cone):
+                return _OF_CONES[function](d, w[0], most.ratio[0], *x)
+            if most is None:
+                return each(lambda d, w, *x: function(d, w, None, *x), d, w, *x)
+            return each(function, d, w, most, *x)
+
         rows = zip(jaref, system.weight, system.bound, *others, strict=True)
-        return [
-            each(lambda d, w, *x: function(d, w, None, *x), d, w, *x)
-            if most is None
-            else each(function, d, w, most, *x)
-            for d, w, most, *x in rows
-        ]
+        return [of_one(*row) for row in rows]
 
     # J qacc - aref of each row, by MuJoCo's name.
     def jaref_at(qacc: Any) -> Any:
@@ -293,8 +400,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         def search_step(search: Any) -> Any:
             (step, is_newton), low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
-            bent = each(jnp.multiply, of_rows(_curvature, there), slope)
-            second = quadratic + dot(bent, slope)
+            second = quadratic + system.total(of_rows(_bend, there, slope))
             rates = of_rows(_rate, there, slope)
             first = linear + step * quadratic + system.total(rates)
             low = jnp.where(first < 0.0, step, low)
@@ -309,6 +415,9 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             goes_on = system.differ(before, now)
             if thorough:  # Half of the way is no step to end with.
                 goes_on |= system.differ(is_newton, is_newton | True)
+            if has_cones:
+                far = jnp.abs(following - step) > 0.01 * step
+                goes_on |= system.differ(far, far & False)
             return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
@@ -320,7 +429,12 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         qacc, moved = each(
             lambda x, change: x + step * change, (qacc, jaref), (direction, slope)
         )
-        return (qacc, moved), system.differ(before, of_rows(_piece, moved))
+        goes_on = system.differ(before, of_rows(_piece, moved))
+        if has_cones:  # Their cost is not quadratic.
+            size = dot(qacc, system.inertia_times(qacc)) + dot(smooth, system.force)
+            far = step * step * quadratic > 1e-11 * size
+            goes_on |= system.differ(far, far & False)
+        return (qacc, moved), goes_on
 
     start = each(choose, (warmstart, at_warmstart), (smooth, at_smooth))
     qacc, jaref = system.repeat(

@@ -154,7 +154,7 @@ class _Block:
     for each group of contacts.
     """
 
-    def __init__(self, refs: Any, size: int, edges: Sequence[Any], counts: Any) -> None:
+    def __init__(self, refs: Any, size: int, groups: Sequence[Any]) -> None:
         """Load a problem.
 
         Args:
@@ -162,10 +162,9 @@ class _Block:
             each of the joints' rows, and for each group to its axes (C, V) and its
             edges' references, weights and bounds (C,).
           size: number of degrees of freedom.
-          edges: each group's edges.
-          counts: each group's contacts.
+          groups: each group's edges, number of contacts and structure of its bounds.
         """
-        inertia, vectors, joints, groups = refs
+        inertia, vectors, joints, contacts = refs
         self.force, self.warmstart = (_load_vector(ref, size) for ref in vectors)
         loaded = [[_load_vector(ref, size) for ref in rows] for rows in joints]
         self.signs = [rows[0] for rows in loaded]
@@ -173,17 +172,19 @@ class _Block:
         self.weight: list[Any] = [rows[2] for rows in loaded]
         # Those of limits have no bound.
         self.bound: list[Any] = [(*rows, None)[3] for rows in loaded]
-        self._size, self._edges = size, edges
+        self._size, self._edges = size, [edges for edges, *_ in groups]
         self._inertia = _loads_of_matrix(inertia, size)
         # For each group a list of axes, each a list of parts (C, W).
         self._basis: list[list[list[Load]]] = []
-        for (axes, *of_edges), count in zip(groups, counts, strict=True):
+        for (axes, *of_edges), (_, count, structure) in zip(
+            contacts, groups, strict=True
+        ):
             references, weights, *bound = [
                 [_load(x, count) for x in values] for values in of_edges
             ]
             self.reference.append(references)
             self.weight.append(weights)
-            self.bound.append(bound[0] if bound else None)
+            self.bound.append(jax.tree.unflatten(structure, bound))
             self._basis.append(
                 [
                     [
@@ -387,19 +388,21 @@ def solve_many(
     groups, of_groups, of_edges, entries = [], [], [], 0
     for group, count in zip(problem.contacts, counts, strict=True):
         arrays = [group.basis, group.reference, group.weight]
-        arrays += [] if group.bound is None else [group.bound]
+        arrays += jax.tree.leaves(group.bound)
         groups.append([list(jnp.moveaxis(x, 1, 0)) for x in arrays])
         contacts = max(_FEWEST_CONTACTS, 1 << (count - 1).bit_length())
         axes, edges = group.basis.shape[1], len(group.edges)
         of_edges.append([_spec(contacts)] * edges)
-        per_edge = [of_edges[-1]] * (len(arrays) - 1)
+        per_edge = [[_spec(contacts)] * x.shape[1] for x in arrays[1:]]
         of_groups.append([[_spec(contacts, padded)] * axes, *per_edge])
         entries += axes * contacts * padded
     read = functools.partial(
         _Block,
         size=size,
-        edges=[group.edges for group in problem.contacts],
-        counts=counts,
+        groups=[
+            (group.edges, len(group.basis), jax.tree.structure(group.bound))
+            for group in problem.contacts
+        ],
     )
     vector = _spec(padded)
     qacc, constraint_force, forces = _call(
