@@ -63,6 +63,23 @@ MODELS = {
         more="""<contact><pair geom1="it" geom2="ground" condim="6" solref="0.03 1"
         friction="1 0.5 0.1 0.1 0.1"/></contact>""",
     ),
+    "cones": drop(
+        CAPSULE,
+        option='cone="elliptic" impratio="10"',
+        world=SECOND.replace("<geom ", '<geom condim="1" '),
+    ),
+    "cones of 6 axes": drop(
+        CAPSULE + ' condim="4" friction="0.3 0.1 0.1"',
+        option='cone="elliptic"',
+        world=SECOND.replace("0 0 .4", "1 0 .19"),
+        more="""<contact><pair geom1="it" geom2="ground" condim="6"
+        friction="1 0.5 0.1 0.1 0.05"/></contact>""",
+    ),
+    "cones in a plane": """<mujoco><option cone="elliptic" timestep="0.01"/><worldbody>
+        <geom type="plane" size="1 1 1"/><body pos="0 0 0.09"><joint type="slide"
+        axis="1 0 0"/><joint type="slide" axis="0 0 1"/><joint axis="0 1 0"/><geom
+        type="capsule" fromto="0.1 0 0 -0.1 0 0.02" size="0.1" friction="0.2"/></body>
+        </worldbody></mujoco>""",
     "exclude": drop(
         world=SECOND,
         more='<contact><exclude body1="one" body2="two"/></contact>',

@@ -622,10 +622,10 @@ def contact_rows(
     if constants.ratio is not None:
         ratio = jnp.broadcast_to(jnp.asarray(constants.ratio), weight.shape)
         count, cone = [1.0], newton.Cone(ratio[:, None])
-    damping = -constants.impedance.damping[:, None] * speed
+    reference = speed * -constants.impedance.damping[:, None]
     return newton.ContactRows(
         basis=along,
-        reference=damping - pull[:, None] * signs[:, 0],
+        reference=reference - pull[:, None] * signs[:, 0],
         weight=weight[:, None] * np.array(count, np.float32)[:, None],
         edges=edges,
         bound=cone,
