@@ -58,6 +58,11 @@ MODELS = {
         'type="box" size="0.1 0.2 0.15"',
         world='<body pos="0 .1 .45"><freejoint/><geom size=".2"/></body>',
     ),
+    "capsule and sphere on a cylinder": drop(
+        'type="cylinder" size="0.2 0.2"',
+        world=f"""<body pos="-.25 -.05 .2"><freejoint/><geom size=".15"/></body>
+        <body pos=".05 .2 .53" euler="0 70 0"><freejoint/><geom {CAPSULE}/></body>""",
+    ),
     "pair": drop(
         CAPSULE + ' contype="0" conaffinity="0"',
         more="""<contact><pair geom1="it" geom2="ground" condim="6" solref="0.03 1"
@@ -152,6 +157,15 @@ MODELS = {
         name="a" damping="1e-8" pos="0.01 0 0"/><geom type="capsule" condim="6"
         size="0.01 0.01" mass="0.001"/></body></worldbody><actuator>
         <motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>""",
+    "strings": drop(
+        'size="0.1"/><site name="a" pos="0.05 0.02 0.08"',
+        world="""<site name="w" pos="0 0.3 0.5"/><body pos="1 0 1"><joint axis="1 2 0"
+        damping="1"/><geom size="0.1" pos="0.2 0 0"/><site name="b" pos="0.3 0 0.1"/>
+        </body>""",
+        more="""<tendon><spatial limited="true" range="0 0.4"><site site="w"/>
+        <site site="a"/></spatial><spatial limited="true" range="0 1.5" margin="0.1">
+        <site site="w"/><site site="a"/><site site="b"/></spatial></tendon>""",
+    ),
     "trees far apart": arms(
         option='integrator="RK4"',
         world="""<body pos="100 0 0"><freejoint/>

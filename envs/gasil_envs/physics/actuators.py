@@ -54,10 +54,12 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `make` does not describe this model's actuators; None if it does."""
     kinds = model.actuator_trntype
     on_joint = np.isin(kinds, _OF_JOINT)
+    of_tendons = model.actuator_trnid[kinds == _OF_TENDON, 0]
     joint = model.jnt_type[model.actuator_trnid[on_joint, 0]]
     if model.na or model.nactuator != model.nu:
         return "it has actuators with a state or with several controls"
-    if not (on_joint | (kinds == _OF_TENDON)).all() or (joint <= tree.BALL).any():
+    others = not (on_joint | (kinds == _OF_TENDON)).all()
+    if others or tendons.strings(model)[of_tendons].any() or (joint <= tree.BALL).any():
         return "it has actuators of other things than slides, hinges and fixed tendons"
     if (
         not np.isin(model.actuator_gaintype, _GAINS).all()

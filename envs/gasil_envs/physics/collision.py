@@ -1,9 +1,10 @@
 """Contacts of geoms with planes that do not move, and of spheres and capsules.
 
 A sphere is a capsule of length 0, and each end of a capsule meets a plane as a sphere.
-Boxes, cylinders and ellipsoids meet planes in points, and a box a sphere. The formulas
-are C MuJoCo's, and every array has the batch as its last axis. Two things differ from
-MJX:
+Boxes, cylinders and ellipsoids meet planes in points, a box meets a sphere, and a
+cylinder spheres and capsules. The formulas are C MuJoCo's (but for a capsule whose axis
+is inside a cylinder, which C pushes out another way), and every array has the batch as
+its last axis. Two things differ from MJX:
 
 - The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
   C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
@@ -16,6 +17,7 @@ Shape letters: C contacts, A axes, B batch.
 """
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -50,7 +52,8 @@ class Pairs:
       end: (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
       points: (2, k), planes and other geoms; all points of a pair follow each other.
       between: (2, m), spheres and capsules.
-      boxes: (2, l), spheres and boxes. Contacts are in the order of these four.
+      solids: (2, l), spheres or capsules and boxes or cylinders. Contacts are in the
+        order of these four.
       num_tangents: number of tangents of a contact.
       motion_normal: (3,), the normal of the plane that all motion is in, or None.
     """
@@ -59,14 +62,14 @@ class Pairs:
     end: np.ndarray
     points: np.ndarray
     between: np.ndarray
-    boxes: np.ndarray
+    solids: np.ndarray
     num_tangents: int
     motion_normal: np.ndarray | None
 
     @property
     def geoms(self) -> np.ndarray:
         """The two geoms of each contact, (C, 2)."""
-        every = [self.on_plane, self.points, self.between, self.boxes]
+        every = [self.on_plane, self.points, self.between, self.solids]
         return np.concatenate(every, axis=1).T
 
 
@@ -101,14 +104,14 @@ def pairs(
     is_second = np.diff(on_plane, prepend=-1) == 0
     end = np.where(second[on_plane] == _CAPSULE, np.where(is_second, -1.0, 1.0), 0.0)
     points = np.repeat(number, count * (plane & ~rounded))
-    between, boxes = number[~plane & rounded], number[~plane & ~rounded]
-    index = np.concatenate([on_plane, points, between, boxes])
+    between, solids = number[~plane & rounded], number[~plane & ~rounded]
+    index = np.concatenate([on_plane, points, between, solids])
     every = Pairs(
         on_plane=geoms[on_plane].T,
         end=end,
         points=geoms[points].T,
         between=geoms[between].T,
-        boxes=geoms[boxes].T,
+        solids=geoms[solids].T,
         num_tangents=num_tangents,
         motion_normal=motion_normal,
     )
@@ -121,7 +124,7 @@ def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
     on_plane = kinds[:, 0] == _PLANE
     round_geoms = [_SPHERE, _CAPSULE]
     for (first, second), plane in zip(kinds, on_plane, strict=True):
-        allowed = [*round_geoms, *_POINTS] if plane else round_geoms
+        allowed = [*round_geoms, *(_POINTS if plane else [_CYLINDER])]
         allowed = [*allowed, _BOX] if first == _SPHERE else allowed
         if second not in allowed or first > _CAPSULE:
             names = " and ".join(
@@ -131,7 +134,8 @@ def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
             return f"it has contacts of {names}"
     if model.body_weldid[model.geom_bodyid[geoms[on_plane, 0]]].any():
         return "it has planes that move"
-    if stay_parallel(model, geoms[(kinds == _CAPSULE).all(axis=1)]):
+    long = (kinds[:, 0] == _CAPSULE) & np.isin(kinds[:, 1], [_CAPSULE, _CYLINDER])
+    if stay_parallel(model, geoms[long]):
         return "it has contacts of capsules that stay parallel"
     return None
 
@@ -202,8 +206,8 @@ def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
         parts.append(_touch_planes_in_points(model, pairs, lines))
     if pairs.between.size:
         parts.append(_touch_each_other(model, pairs, lines))
-    if pairs.boxes.size:
-        parts.append(_touch_boxes(model, pairs, lines))
+    if pairs.solids.size:
+        parts.append(_touch_solids(model, pairs, lines))
     if len(parts) == 1:
         return parts[0]
     distance = jnp.concatenate([part.distance for part in parts])
@@ -335,41 +339,84 @@ def _rim(size: np.ndarray, columns: list[jax.Array], up: list[jax.Array]) -> _Po
     return points + [(axis - 0.5 * low + s * side, corner) for s in (1.0, -1.0)]
 
 
-def _touch_boxes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
+# Halvings until the point of a capsule that is nearest to a cylinder is known.
+_HALVINGS = 25
+
+
+def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     distances: list[jax.Array] = []
     positions: list[jax.Array] = []
     normals: list[jax.Array] = []
-    for sphere, box in pairs.boxes.T:
-        radius, columns = float(model.geom_size[sphere, 0]), lines.columns[box]
-        size = model.geom_size[box].astype(np.float32)[:, None]
-        offset = lines.middle[sphere] - lines.middle[box]
-        centre = stacked([total(column * offset) for column in columns])
-        clamped = jnp.clip(centre, -size, size)
-        away = clamped - centre
-        apart = jnp.sqrt(total(away**2))
-        # Where the sphere's centre is inside, the nearest side.
-        depth = size - jnp.abs(centre)
-        first, second, third = (
-            (depth[i] <= jnp.minimum(depth[i - 1], depth[i - 2])).astype(jnp.float32)
-            for i in range(3)
-        )
-        second = second * (1 - first)
-        side = jnp.stack([first, second, third * (1 - first) * (1 - second)])
-        inside = apart <= 1e-7
-        inwards = jnp.where(centre > 0.0, -1.0, 1.0) * side
-        distance = jnp.where(inside, -total(side * depth), apart)
+    for geom, solid in pairs.solids.T:
+        columns, up = lines.columns[solid], np.eye(3, dtype=np.float32)[..., None]
+        size = model.geom_size[solid].astype(np.float32)[:, None]
+        is_round = model.geom_type[solid] == _CYLINDER
+
+        def local(x: jax.Array, columns: list[jax.Array] = columns) -> jax.Array:
+            return stacked([total(column * x) for column in columns])
+
+        def nearest(
+            x: jax.Array, is_round: Any = is_round, size: np.ndarray = size
+        ) -> jax.Array:
+            """Return the point of the solid that is nearest to x."""
+            if not is_round:
+                return jnp.clip(x, -size, size)
+            within = jnp.minimum(size[0] / jnp.maximum(_length(x[:2]), 1e-15), 1.0)
+            flat = jnp.clip(x[2], -size[1], size[1])
+            return jnp.stack([x[0] * within, x[1] * within, flat])
+
+        centre = local(lines.middle[geom] - lines.middle[solid])
+        if model.geom_type[geom] == _CAPSULE:
+            centre = _nearest_on_line(nearest, centre, local(lines.half[geom]))
+        away = nearest(centre) - centre
+        apart = _length(away)
+        sides = list(zip(centre, size, up, strict=True))
+        if is_round:
+            across = jnp.concatenate([centre[:2], 0.0 * centre[2:]])
+            length = _length(across)
+            sides = [(length, size[0], across / jnp.maximum(length, 1e-15))]
+            sides.append((centre[2], size[1], up[2]))
+        # Where the centre is inside, the nearest side.
+        depth, inwards = jnp.full_like(apart, jnp.inf), jnp.zeros_like(centre)
+        for along, most, axis in sides:
+            nearer = most - jnp.abs(along) < depth
+            depth = jnp.where(nearer, most - jnp.abs(along), depth)
+            inwards = jnp.where(nearer, jnp.where(along > 0.0, -axis, axis), inwards)
+        inside, radius = apart <= 1e-7, float(model.geom_size[geom, 0])
+        distance = jnp.where(inside, -depth, apart)
         normal = jnp.where(inside, inwards, away / jnp.maximum(apart, 1e-7))
         position = centre + normal * (0.5 * (radius + distance))
         distances.append(distance - radius)
-        for local, results in ((position, positions), (normal, normals)):
-            results.append(add(local[i] * columns[i] for i in range(3)))
-        positions[-1] = positions[-1] + lines.middle[box]
+        for x, results in ((position, positions), (normal, normals)):
+            results.append(add(x[i] * columns[i] for i in range(3)))
+        positions[-1] = positions[-1] + lines.middle[solid]
     normal = stacked(normals)
     axes = [normal]
     if pairs.num_tangents:
         axes.append(_orthogonal(normal))
         axes.append(tree.cross(normal, axes[1]))
     return Touch(stacked(distances), stacked(positions), jnp.stack(axes, axis=1))
+
+
+def _length(x: jax.Array) -> jax.Array:
+    return jnp.sqrt(total(x**2))
+
+
+def _nearest_on_line(
+    nearest: Callable[[jax.Array], jax.Array], middle: jax.Array, half: jax.Array
+) -> jax.Array:
+    """Return the point of a line that is nearest to a convex body, (3, B)."""
+
+    def halve(_: Any, ends: tuple[jax.Array, jax.Array]) -> Any:
+        low, high = ends
+        at = 0.5 * (low + high)
+        point = middle + at * half
+        falls = total((point - nearest(point)) * half) < 0.0
+        return jnp.where(falls, at, low), jnp.where(falls, high, at)
+
+    one = jnp.ones_like(middle[0])
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (-one, one))
+    return middle + 0.5 * (low + high) * half
 
 
 def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:

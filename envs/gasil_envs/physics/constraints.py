@@ -196,9 +196,10 @@ class Limits(NamedTuple):
     strength: Strength
 
 
-#: (nq, B) positions -> (n, B) how far n rows are from being held, and their Jacobians
-#: (n, V, B). Rows that only push act where that is negative.
-Residual = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+#: (nq, B) positions and where they place the bodies -> (n, B) how far n rows are from
+#: being held, and their Jacobians (n, V, B). Rows that only push act where that is
+#: negative.
+Residual = Callable[[jax.Array, tree.Kinematics], tuple[jax.Array, jax.Array]]
 
 
 class Layout(NamedTuple):
@@ -457,7 +458,7 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
         for i in (model.eq_obj1id[index], model.eq_obj2id[index])
     )
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         own, x = (
             constant_times(of_qpos[i], qpos) - start[i, None].astype(np.float32)
             for i in (first, second)
@@ -482,7 +483,7 @@ def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
         return None
     of_qvel = tendons.fixed(model).of_qvel[index]
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         return _wide(np.zeros(index.size), qpos), _wide(of_qvel, qpos)
 
     solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
@@ -494,15 +495,14 @@ def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     index = np.flatnonzero(model.tendon_limited)
     if not index.size:
         return None
-    of_qpos, of_qvel = (x[index] for x in tendons.fixed(model))
     low, high = model.tendon_range[index].T[..., None].astype(np.float32)
     margin = model.tendon_margin[index, None].astype(np.float32)
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        length = constant_times(of_qpos, qpos)
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
+        length, jacobian = tendons.lengths(model, index, qpos, at)
         sign = jnp.where(length - low < high - length, 1.0, -1.0)
         distance = jnp.minimum(length - low, high - length) - margin
-        return distance, sign[:, None] * _wide(of_qvel, qpos)
+        return distance, sign[:, None] * jacobian
 
     solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
     return Strength.of(model, model.tendon_invweight0[index], solver), residual
@@ -514,7 +514,7 @@ def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
         return None
     most = model.jnt_range[index].max(axis=1) - model.jnt_margin[index]
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         angles, jacobians = [], []
         for joint in index:
             first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
@@ -544,10 +544,15 @@ def friction_rows(friction: Strength, qvel: jax.Array) -> newton.JointRows:
 
 @jax.named_scope("constraint_rows")
 def other_rows(
-    strength: Strength, residual: Residual, qpos: jax.Array, *, qvel: jax.Array
+    strength: Strength,
+    residual: Residual,
+    at: tree.Kinematics,
+    *,
+    qpos: jax.Array,
+    qvel: jax.Array,
 ) -> newton.ContactRows:
     """Return rows of joints or tendons as contacts with one axis."""
-    distance, jacobian = residual(qpos)
+    distance, jacobian = residual(qpos, at)
     inverse_weight, solimp, bound = strength
     acts = distance < 0.0 if bound is None else jnp.ones_like(distance, bool)
     jacobian = materialize(jnp.where(acts[:, None], jacobian, 0.0))

@@ -197,7 +197,8 @@ def forward(
     if dynamics.layout.friction is not None:
         joints.append(constraints.friction_rows(dynamics.layout.friction, qvel))
     others = [
-        constraints.other_rows(*x, qpos, qvel=qvel) for x in dynamics.layout.others
+        constraints.other_rows(*x, at, qpos=qpos, qvel=qvel)
+        for x in dynamics.layout.others
     ]
     trees = tree.trees(model)
 
