@@ -30,6 +30,7 @@ from gasil_envs.physics.batching import (
     add,
     constant_times,
     materialize,
+    on_cpu,
     stacked,
     take,
     total,
@@ -415,7 +416,8 @@ def _nearest_on_line(
         return jnp.where(falls, at, low), jnp.where(falls, high, at)
 
     one = jnp.ones_like(middle[0])
-    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (-one, one))
+    unroll = 1 if on_cpu() else _HALVINGS  # On a GPU each turn would be some kernels.
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (-one, one), unroll=unroll)
     return middle + 0.5 * (low + high) * half
 
 
