@@ -67,16 +67,13 @@ class Wrapper(Env):
         self.env = env
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode; consumes the key."""
         return self.env.reset(rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step."""
         return self.env.step(state, action)
 
     @property
     def unwrapped(self) -> Any:
-        """The environment without wrappers."""
         return self.env.unwrapped
 
     def __getattr__(self, name: str) -> Any:

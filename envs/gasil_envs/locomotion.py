@@ -505,11 +505,7 @@ class Locomotion(Env):
     """
 
     def __init__(
-        self,
-        task: str | Task,
-        *,
-        physics: str = "jax",
-        integrator: str = "model",
+        self, task: str | Task, *, physics: str = "jax", integrator: str = "model"
     ):
         for what, name, names in (
             ("task", task, TASKS),
@@ -533,39 +529,17 @@ class Locomotion(Env):
         # A NumPy array becomes a constant of the traced functions.
         qpos, qvel = _start(task, self.model)
         self._start, self._start_velocity = np.float32(qpos), np.float32(qvel)
-        self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
-
-    @property
-    def episode_length(self) -> int:
-        """Number of steps after which an episode is truncated."""
-        return self.task.episode_length
+        self.episode_length, self.action_size = task.episode_length, self.model.nu
+        self.action_range = tuple(self.model.actuator_ctrlrange.T.astype(np.float32))
+        self.backend = self.physics.name
+        first = jax.eval_shape(self.reset, jax.random.key(0))
+        self.observation_size = first.obs.shape[0]
 
     @property
     def ends_early(self) -> bool:
         """Whether an episode can end before its step limit."""
         bounds = (self.task.healthy_z, self.task.healthy_angle, self.task.healthy_state)
         return self.task.healthy is not None or any(x != _EVERYTHING for x in bounds)
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return self._observation_size[0]
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector: the number of actuators."""
-        return self.model.nu
-
-    @property
-    def action_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest control, float32 (action,) each."""
-        low, high = self.model.actuator_ctrlrange.T.astype(np.float32)
-        return low, high
-
-    @property
-    def backend(self) -> str:
-        """The name of the physics engine that steps the model."""
-        return self.physics.name
 
     def reset(self, rng: jax.Array) -> State:
         """Start as the task says, or at rest with noise on positions and velocities."""
@@ -601,7 +575,6 @@ class Locomotion(Env):
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advance `frame_skip` physics steps under one action."""
         task, before = self.task, state.pipeline_state
         physics, fields = self.physics.step(before.physics, action, task.frame_skip)
         position = self._position(physics, fields)

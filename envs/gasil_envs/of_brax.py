@@ -24,12 +24,7 @@ class _OfBrax(Wrapper):
 
     def __init__(self, env: Any, observation_size: int):
         super().__init__(env)
-        self._observation_size = observation_size
-
-    @property
-    def observation_size(self) -> int:
-        """The number of numbers in an observation."""
-        return self._observation_size
+        self.observation_size = observation_size
 
 
 def names() -> tuple[str, ...]:

@@ -92,51 +92,11 @@ class LocomotionPainter:
             scene.ngeom += 1
 
     def moment(self, step: int) -> str:
-        """Return the time of a step as the label of its picture."""
+        """Return the label of a step's picture."""
         return f"{step * self.seconds_per_step:.2f} s"
 
     def close(self) -> None:
-        """Free the OpenGL context."""
         self._renderer.close()
-
-
-class PointMassPainter:
-    """Draws the point mass, its objects and its path.
-
-    Args:
-      env: the point mass, without wrappers.
-      size: width and height of a picture in pixels.
-    """
-
-    seconds_per_step = 0.1
-
-    def __init__(self, env: PointMass, size: tuple[int, int]):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-
-        self._layout = env.layout
-        figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
-        self._canvas = FigureCanvasAgg(figure)
-        self._axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
-
-    def draw(self, episode: Sequence[Any]) -> np.ndarray:
-        """Return a picture of the path so far, uint8 (height, width, 3)."""
-        positions = np.stack([state.position for state in episode])
-        axes = self._axes
-        axes.clear()
-        point_mass_layout(axes, self._layout, episode[-1].collected)
-        axes.plot(*positions.T, color="0.3", linewidth=1)
-        axes.plot(*positions[-1], "o", color="black", markersize=6)
-        axes.set(xticks=[], yticks=[])
-        self._canvas.draw()
-        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
-
-    def moment(self, step: int) -> str:
-        """Return the number of a step as the label of its picture."""
-        return f"step {step}"
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to free."""
 
 
 class OwnPainter:
@@ -169,14 +129,45 @@ class OwnPainter:
         return picture
 
     def moment(self, step: int) -> str:
-        """Return the number of a step as the label of its picture."""
         return f"step {step}"
 
     def close(self) -> None:
         """Do nothing: there is nothing to free."""
 
 
-Painter = LocomotionPainter | PointMassPainter | OwnPainter
+class PointMassPainter(OwnPainter):
+    """Draws the point mass, its objects and its path.
+
+    Args:
+      env: the point mass, without wrappers.
+      size: width and height of a picture in pixels.
+    """
+
+    seconds_per_step = 0.1
+
+    def __init__(self, env: PointMass, size: tuple[int, int]):
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        self._layout = env.layout
+        figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100)
+        self._canvas = FigureCanvasAgg(figure)
+        self._axes = figure.add_axes((0.01, 0.01, 0.98, 0.98))
+
+    def draw(self, episode: Sequence[Any]) -> np.ndarray:
+        """Return a picture of the path so far, uint8 (height, width, 3)."""
+        positions = np.stack([state.position for state in episode])
+        axes = self._axes
+        axes.clear()
+        point_mass_layout(axes, self._layout, episode[-1].collected)
+        axes.plot(*positions.T, color="0.3", linewidth=1)
+        axes.plot(*positions[-1], "o", color="black", markersize=6)
+        axes.set(xticks=[], yticks=[])
+        self._canvas.draw()
+        return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+Painter = LocomotionPainter | OwnPainter
 
 
 def can_draw(env: Env) -> bool:

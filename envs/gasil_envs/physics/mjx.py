@@ -172,7 +172,6 @@ class MjxPhysics:
             )
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     def _data(self, state: PhysicsState) -> Any:
@@ -190,7 +189,6 @@ class MjxPhysics:
     @partial(jax.jit, static_argnums=0)
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         mjx = _mjx()
         data = mjx.kinematics(self._model, self._data(state))
         data = mjx.com_pos(self._model, data)
@@ -200,7 +198,6 @@ class MjxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
         return self._step(state, control, frame_skip)
 
     # MJX takes seconds to trace this, which the check of the model needs too.

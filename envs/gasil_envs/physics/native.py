@@ -159,17 +159,14 @@ class MujocoPhysics:
         self._place = batch_last(partial(dynamics.kinematics, model, self._fields))
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         return self._place(state)
 
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
         host_threads.check()
         cores = host_threads.available_cores()
         threads = self._threads or max(1, cores // jax.local_device_count())

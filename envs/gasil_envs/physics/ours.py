@@ -95,12 +95,10 @@ class JaxPhysics:
         return parts + tree.rounding(own.model)
 
     def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
         return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         own = self._dynamics
         place = partial(dynamics.kinematics, own.model, own.fields)
         return batch_last(place)(state)
@@ -109,7 +107,6 @@ class JaxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
 
         def many(x: Any) -> Any:
             return dynamics.step(self._dynamics, x[0], x[1], frame_skip)
