@@ -24,22 +24,14 @@ _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
 
 class Actuators(NamedTuple):
-    """The constants of nu actuators.
+    """The constants of nu actuators."""
 
-    Attributes:
-      transmission: the lengths and velocities of the actuators.
-      gain: (nu, 3), constant, of length, of velocity.
-      bias: (nu, 3), the same.
-      control_range: (2, nu, 1).
-      force_range: (2, nu, 1).
-      joint_range: (2, V, 1), of the sum of the forces on a degree of freedom.
-    """
-
-    transmission: tendons.Tendons
-    gain: np.ndarray
-    bias: np.ndarray
-    control_range: np.ndarray
-    force_range: np.ndarray
+    transmission: tendons.Tendons  # The lengths and velocities of the actuators.
+    gain: np.ndarray  # (nu, 3), constant, of length, of velocity.
+    bias: np.ndarray  # (nu, 3), the same.
+    control_range: np.ndarray  # (2, nu, 1).
+    force_range: np.ndarray  # (2, nu, 1).
+    #: (2, V, 1), of the sum of the forces on a degree of freedom.
     joint_range: np.ndarray
 
     @property

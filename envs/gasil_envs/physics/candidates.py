@@ -14,23 +14,15 @@ _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 class Candidates(NamedTuple):
-    """Pairs of geoms that may touch, P of them.
+    """Pairs of geoms that may touch, P of them."""
 
-    Attributes:
-      geoms: (P, 2), the one whose type has the lower number first.
-      dim: (P,), number of dimensions of the contact's force, condim.
-      margin: (P,), distance in metres from which a contact is in play.
-      friction: (P, 5), of two tangents, of turning about the normal and about them.
-      solref: (P, 2).
-      solimp: (P, 5).
-    """
-
-    geoms: np.ndarray
-    dim: np.ndarray
-    margin: np.ndarray
+    geoms: np.ndarray  # (P, 2), the one whose type has the lower number first.
+    dim: np.ndarray  # (P,), number of dimensions of the contact's force, condim.
+    margin: np.ndarray  # (P,), distance in metres from which a contact is in play.
+    #: (P, 5), of two tangents, of turning about the normal and about them.
     friction: np.ndarray
-    solref: np.ndarray
-    solimp: np.ndarray
+    solref: np.ndarray  # (P, 2).
+    solimp: np.ndarray  # (P, 5).
 
 
 def candidates(model: mujoco.MjModel) -> Candidates:

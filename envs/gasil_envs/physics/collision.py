@@ -46,25 +46,18 @@ _POINTS = {_ELLIPSOID: 1, _CYLINDER: 4, _BOX: 8}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs of geoms of one group of contacts.
+    """The pairs of geoms of one group of contacts."""
 
-    Attributes:
-      on_plane: (2, n), planes and spheres or capsules.
-      end: (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
-      points: (2, k), planes and other geoms; all points of a pair follow each other.
-      between: (2, m), spheres and capsules.
-      solids: (2, l), spheres or capsules and boxes or cylinders. Contacts are in the
-        order of these four.
-      num_tangents: number of tangents of a contact.
-      motion_normal: (3,), the normal of the plane that all motion is in, or None.
-    """
-
-    on_plane: np.ndarray
-    end: np.ndarray
+    on_plane: np.ndarray  # (2, n), planes and spheres or capsules.
+    end: np.ndarray  # (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
+    #: (2, k), planes and other geoms; all points of a pair follow each other.
     points: np.ndarray
-    between: np.ndarray
+    between: np.ndarray  # (2, m), spheres and capsules.
+    #: (2, l), spheres or capsules and boxes or cylinders. Contacts are in the order of
+    #: these four.
     solids: np.ndarray
-    num_tangents: int
+    num_tangents: int  # Number of tangents of a contact.
+    #: (3,), the normal of the plane that all motion is in, or None.
     motion_normal: np.ndarray | None
 
     @property
@@ -75,16 +68,11 @@ class Pairs:
 
 
 class Touch(NamedTuple):
-    """Where contacts are, in metres. An axis of length 1 is broadcast.
+    """Where contacts are, in metres. An axis of length 1 is broadcast."""
 
-    Attributes:
-      distance: (C, B), negative if they penetrate.
-      position: (C, 3, B).
-      axes: (C or 1, A, 3, B or 1): normal from the first geom to the second, tangents.
-    """
-
-    distance: jax.Array
-    position: jax.Array
+    distance: jax.Array  # (C, B), negative if they penetrate.
+    position: jax.Array  # (C, 3, B).
+    #: (C or 1, A, 3, B or 1): normal from the first geom to the second, tangents.
     axes: jax.Array | np.ndarray
 
 
@@ -128,11 +116,8 @@ def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
         allowed = [*round_geoms, *(_POINTS if plane else [_CYLINDER])]
         allowed = [*allowed, _BOX] if first == _SPHERE else allowed
         if second not in allowed or first > _CAPSULE:
-            names = " and ".join(
-                mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-                for kind in (first, second)
-            )
-            return f"it has contacts of {names}"
+            names = [mujoco.mjtGeom(x).name[len("mjGEOM_") :] for x in (first, second)]
+            return f"it has contacts of {' and '.join(names).lower()}"
     if model.body_weldid[model.geom_bodyid[geoms[on_plane, 0]]].any():
         return "it has planes that move"
     long = (kinds[:, 0] == _CAPSULE) & np.isin(kinds[:, 1], [_CAPSULE, _CYLINDER])
@@ -163,16 +148,11 @@ def depth(model: mujoco.MjModel) -> float:
 
 
 class Segments(NamedTuple):
-    """The lines along the middle of geoms, metres.
+    """The lines along the middle of geoms, metres."""
 
-    Attributes:
-      middle: (geom, 3, B), their centres.
-      half: (geom, 3, B), from there to one end.
-      columns: rotations of the geoms that are no capsules, spheres or planes.
-    """
-
-    middle: jax.Array
-    half: jax.Array
+    middle: jax.Array  # (geom, 3, B), their centres.
+    half: jax.Array  # (geom, 3, B), from there to one end.
+    #: Rotations of the geoms that are no capsules, spheres or planes.
     columns: dict[int, list[jax.Array]]
 
 
@@ -181,8 +161,8 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
     """Return the line of each geom; that of a sphere or a plane is a point."""
     middle, half, rotations = [], [], {}
     for geom in range(model.ngeom):
-        columns = at.columns[model.geom_bodyid[geom]]
-        origin = at.xpos[model.geom_bodyid[geom]]
+        body = model.geom_bodyid[geom]
+        columns, origin = at.columns[body], at.xpos[body]
         middle.append(origin + tree.rotate(columns, model.geom_pos[geom]))
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
@@ -200,25 +180,21 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
 @jax.named_scope("collision")
 def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     """Return the contacts of a group."""
-    parts = []
-    if pairs.on_plane.size:
-        parts.append(_touch_planes(model, pairs, lines))
-    if pairs.points.size:
-        parts.append(_touch_planes_in_points(model, pairs, lines))
-    if pairs.between.size:
-        parts.append(_touch_each_other(model, pairs, lines))
-    if pairs.solids.size:
-        parts.append(_touch_solids(model, pairs, lines))
+    kinds = (
+        (pairs.on_plane, _touch_planes),
+        (pairs.points, _touch_planes_in_points),
+        (pairs.between, _touch_each_other),
+        (pairs.solids, _touch_solids),
+    )
+    parts = [function(model, pairs, lines) for x, function in kinds if x.size]
     if len(parts) == 1:
         return parts[0]
-    distance = jnp.concatenate([part.distance for part in parts])
-    position = jnp.concatenate([part.position for part in parts])
-
-    def shape(x: Touch) -> tuple[int, ...]:
-        return (x.position.shape[0], x.axes.shape[1], *x.position.shape[1:])
-
-    axes = [jnp.broadcast_to(part.axes, shape(part)) for part in parts]
-    return Touch(distance, position, jnp.concatenate(axes))
+    distance, position, axes = zip(*parts, strict=True)
+    wide = [
+        jnp.broadcast_to(x, (len(y), x.shape[1], *y.shape[1:]))
+        for x, y in zip(axes, position, strict=True)
+    ]
+    return Touch(*map(jnp.concatenate, (distance, position, wide)))
 
 
 def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
@@ -228,11 +204,10 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     def constant(x: Any) -> Any:
         return x.astype(np.float32)[..., None]
 
-    height = constant(height)
     radius = constant(model.geom_size[geom, 0])
     axis = take(lines.half, geom)
     centre = take(lines.middle, geom) + constant(pairs.end[:, None]) * axis
-    distance = total(constant(normal) * centre, 1) - height - radius
+    distance = total(constant(normal) * centre, 1) - constant(height) - radius
     position = centre - constant(normal) * (radius + 0.5 * distance)[:, None]
     if np.allclose(normal, normal[0]):
         normal = normal[:1]
@@ -276,9 +251,10 @@ def _touch_planes_in_points(
         elif model.geom_type[geom] == _CYLINDER:
             points = _rim(size, columns, up)
         else:
-            length = jnp.sqrt(total(jnp.stack(up) ** 2 * _squares(size)))
+            square = (size**2).astype(np.float32)[:, None]
+            length = jnp.sqrt(total(jnp.stack(up) ** 2 * square))
             lowest = -total(
-                jnp.stack(columns) * jnp.stack(up)[:, None] * _squares(size)[..., None]
+                jnp.stack(columns) * jnp.stack(up)[:, None] * square[..., None]
             )
             points = [(lowest / length, -length)]
         for away, lower in points:
@@ -288,15 +264,7 @@ def _touch_planes_in_points(
             positions.append(centre - normal.astype(np.float32)[:, None] * down)
             axes.append(normal)
     normals = jnp.asarray(np.stack(axes).astype(np.float32)[..., None])
-    frame = [normals]
-    if pairs.num_tangents:
-        frame.append(_orthogonal(normals))
-        frame.append(tree.cross(frame[0], frame[1]))
-    return Touch(stacked(distances), stacked(positions), jnp.stack(frame, axis=1))
-
-
-def _squares(size: np.ndarray) -> np.ndarray:
-    return (size**2).astype(np.float32)[:, None]
+    return Touch(stacked(distances), stacked(positions), _frames(pairs, normals))
 
 
 def _dot(vector: jax.Array, constant: np.ndarray) -> jax.Array:
@@ -391,12 +359,8 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
         for x, results in ((position, positions), (normal, normals)):
             results.append(add(x[i] * columns[i] for i in range(3)))
         positions[-1] = positions[-1] + lines.middle[solid]
-    normal = stacked(normals)
-    axes = [normal]
-    if pairs.num_tangents:
-        axes.append(_orthogonal(normal))
-        axes.append(tree.cross(normal, axes[1]))
-    return Touch(stacked(distances), stacked(positions), jnp.stack(axes, axis=1))
+    axes = _frames(pairs, stacked(normals))
+    return Touch(stacked(distances), stacked(positions), axes)
 
 
 def _length(x: jax.Array) -> jax.Array:
@@ -451,6 +415,11 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     )
     distance = apart - (radius[0] + radius[1])
     position = near_a + normal * (radius[0] + 0.5 * distance)[:, None]
+    return Touch(distance, position, _frames(pairs, normal))
+
+
+def _frames(pairs: Pairs, normal: jax.Array) -> jax.Array:
+    """Return normals (C, 3, B) and as many tangents as a group has, (C, A, 3, B)."""
     axes = [normal]
     if pairs.num_tangents and pairs.motion_normal is not None:
         across = pairs.motion_normal.astype(np.float32)[:, None]
@@ -458,7 +427,7 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     elif pairs.num_tangents:
         axes.append(_orthogonal(normal))
         axes.append(tree.cross(normal, axes[1]))
-    return Touch(distance, position, jnp.stack(axes, axis=1))
+    return jnp.stack(axes, axis=1)
 
 
 def _nearest_points(

@@ -117,29 +117,23 @@ class Constants(struct.PyTreeNode):
     """The constants of a group's contacts, (C or 1, ..., 1) each.
 
     They do not depend on the state.
-
-    Attributes:
-      chain: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it
-        moves the first and 0 where it moves both or none.
-      body: (C, N, 1), 1 at the second body and -1 at the first, unless that is the
-        world; 0 elsewhere.
-      friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes;
-        of cones these divided by their ratio.
-      ratio: (C or 1, 1), that of elliptic cones, see `newton.Cone`; None of pyramids.
-      margin: distance from which a contact is in play.
-      inverse_weight: of an edge of the pyramid.
-      least_resistance: of an edge, the inverse of its greatest weight.
-      impedance: of an edge.
     """
 
+    #: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it moves
+    #: the first and 0 where it moves both or none.
     chain: np.ndarray
+    #: (C, N, 1), 1 at the second body and -1 at the first, unless that is the world; 0
+    #: elsewhere.
     body: np.ndarray
+    #: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes; of cones
+    #: these divided by their ratio.
     friction: np.ndarray
+    #: (C or 1, 1), that of elliptic cones, see `newton.Cone`; None of pyramids.
     ratio: np.ndarray | None
-    margin: np.ndarray
-    inverse_weight: np.ndarray
-    least_resistance: np.ndarray
-    impedance: Impedance
+    margin: np.ndarray  # Distance from which a contact is in play.
+    inverse_weight: np.ndarray  # Of an edge of the pyramid.
+    least_resistance: np.ndarray  # Of an edge, the inverse of its greatest weight.
+    impedance: Impedance  # Of an edge.
 
 
 class Group(NamedTuple):
@@ -155,16 +149,11 @@ class Group(NamedTuple):
 
 
 class Strength(NamedTuple):
-    """How hard n rows push or pull, none of them of contacts.
+    """How hard n rows push or pull, none of them of contacts."""
 
-    Attributes:
-      inverse_weight: (n or 1, 1).
-      impedance: the coefficients.
-      bound: (n, 1), largest force of rows that push and pull; None if they only push.
-    """
-
-    inverse_weight: np.ndarray
+    inverse_weight: np.ndarray  # (n or 1, 1).
     impedance: Impedance
+    #: (n, 1), largest force of rows that push and pull; None if they only push.
     bound: np.ndarray | None
 
     @classmethod
@@ -177,21 +166,13 @@ class Strength(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The limits of L slide and hinge joints, in metres or radians.
+    """The limits of L slide and hinge joints, in metres or radians."""
 
-    Attributes:
-      qpos: int (L,), index of each joint in qpos.
-      dof: int (L,), index of its degree of freedom.
-      low: float32 (L or 1, 1), its lower limit.
-      high: float32 (L or 1, 1), its upper limit.
-      margin: float32 (L or 1, 1), distance to a limit below which the limit acts.
-      strength: that of the limits.
-    """
-
-    qpos: np.ndarray
-    dof: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    qpos: np.ndarray  # int (L,), index of each joint in qpos.
+    dof: np.ndarray  # int (L,), index of its degree of freedom.
+    low: np.ndarray  # float32 (L or 1, 1), its lower limit.
+    high: np.ndarray  # float32 (L or 1, 1), its upper limit.
+    #: float32 (L or 1, 1), distance to a limit below which the limit acts.
     margin: np.ndarray
     strength: Strength
 

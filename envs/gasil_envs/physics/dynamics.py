@@ -29,25 +29,16 @@ FIELDS = (
 
 
 class Dynamics(NamedTuple):
-    """A model, and the parts of its dynamics that do not depend on the state.
-
-    Attributes:
-      model: the model.
-      layout: layout of the constraints.
-      actuators: the actuators' constants.
-      tendons: the fixed tendons.
-      iterations: largest numbers of iterations of the solver and of a line search.
-      presses: whether float32 may lose digits of the constraints' forces.
-      fields: names of the fields to return, of `FIELDS`.
-    """
+    """A model, and the parts of its dynamics that do not depend on the state."""
 
     model: mujoco.MjModel
     layout: constraints.Layout
     actuators: actuators.Actuators
-    tendons: tendons.Tendons
+    tendons: tendons.Tendons  # The fixed tendons.
+    #: Largest numbers of iterations of the solver and of a line search.
     iterations: tuple[int, int]
-    presses: bool
-    fields: tuple[str, ...]
+    presses: bool  # Whether float32 may lose digits of the constraints' forces.
+    fields: tuple[str, ...]  # Names of the fields to return, of `FIELDS`.
 
 
 # From this stiffness of contacts on, and from this depth at the start in sizes of a
@@ -128,18 +119,11 @@ def make(
 
 
 class _Evaluation(NamedTuple):
-    """The result of one evaluation of the dynamics.
+    """The result of one evaluation of the dynamics."""
 
-    Attributes:
-      inertia: (V, V, B).
-      force: (V, B), all forces.
-      qacc: (V, B).
-      fields: the fields to return.
-    """
-
-    inertia: jax.Array
-    force: jax.Array
-    qacc: jax.Array
+    inertia: jax.Array  # (V, V, B).
+    force: jax.Array  # (V, B), all forces.
+    qacc: jax.Array  # (V, B).
     fields: Fields
 
 

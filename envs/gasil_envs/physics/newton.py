@@ -50,82 +50,59 @@ class Cone(NamedTuple):
       D/2 (u^2 + t^2) where ratio u + t <= 0: friction holds it,
       D/2 (u - ratio t)^2 / (1 + ratio^2) else, where u < ratio t: it slides,
       0 where it does not touch.
-
-    Attributes:
-      ratio: (C, 1), the first friction / sqrt(impratio).
     """
 
-    ratio: Any
+    ratio: Any  # (C, 1), the first friction / sqrt(impratio).
 
 
 class ContactRows(struct.PyTreeNode):
-    """The rows of a group of contacts with the same number of edges; float32.
+    """The rows of a group of contacts with the same number of edges; float32."""
 
-    Attributes:
-      basis: (C, A, V), Jacobians of the normal and of the tangents times the friction;
-        zero where out of play.
-      reference: (C, E), aref of the edges.
-      weight: (C, E), D of the edges, (C, 1) of cones; 0 where out of play and above 0
-        elsewhere.
-      edges: E rows of A signs: an edge is their product with the axes.
-      bound: (C, E), largest force of rows that push and pull; None if they only push;
-        or the cones.
-    """
-
+    #: (C, A, V), Jacobians of the normal and of the tangents times the friction; zero
+    #: where out of play.
     basis: jax.Array
-    reference: jax.Array
+    reference: jax.Array  # (C, E), aref of the edges.
+    #: (C, E), D of the edges, (C, 1) of cones; 0 where out of play and above 0
+    #: elsewhere.
     weight: jax.Array
+    #: E rows of A signs: an edge is their product with the axes.
     edges: tuple[tuple[int, ...], ...] = struct.field(pytree_node=False)
+    #: (C, E), largest force of rows that push and pull; None if they only push; or the
+    #: cones.
     bound: jax.Array | Cone | None = None
 
 
 class JointRows(struct.PyTreeNode):
-    """Rows of one degree of freedom each, its limit or its dry friction; float32.
+    """Rows of one degree of freedom each, its limit or its dry friction; float32."""
 
-    Attributes:
-      sign: (V,), the Jacobian: 1 of friction and at a lower limit, -1 at an upper one,
-        0 in between.
-      reference: (V,), aref.
-      weight: (V,), D, at least 0.
-      bound: (V,), largest force of friction; None of limits, which only push.
-    """
-
+    #: (V,), the Jacobian: 1 of friction and at a lower limit, -1 at an upper one, 0 in
+    #: between.
     sign: jax.Array
-    reference: jax.Array
-    weight: jax.Array
+    reference: jax.Array  # (V,), aref.
+    weight: jax.Array  # (V,), D, at least 0.
+    #: (V,), largest force of friction; None of limits, which only push.
     bound: jax.Array | None = None
 
 
 class Problem(struct.PyTreeNode):
-    """The constrained dynamics of one instant; float32.
+    """The constrained dynamics of one instant; float32."""
 
-    Attributes:
-      inertia: (V, V), the joint-space inertia M.
-      force: (V,), all forces but the constraints': M qacc_smooth.
-      warmstart: (V,), initial guess, used if it is better than qacc_smooth.
-      joints: the joints' limits, and their dry friction if there is any.
-      contacts: groups of contacts, and of other rows as contacts with one axis.
-    """
-
-    inertia: jax.Array
-    force: jax.Array
-    warmstart: jax.Array
+    inertia: jax.Array  # (V, V), the joint-space inertia M.
+    force: jax.Array  # (V,), all forces but the constraints': M qacc_smooth.
+    warmstart: jax.Array  # (V,), initial guess, used if it is better than qacc_smooth.
+    #: The joints' limits, and their dry friction if there is any.
     joints: tuple[JointRows, ...]
+    #: Groups of contacts, and of other rows as contacts with one axis.
     contacts: tuple[ContactRows, ...] = ()
 
 
 class Solution(struct.PyTreeNode):
-    """The accelerations and the forces of the constraints; float32.
+    """The accelerations and the forces of the constraints; float32."""
 
-    Attributes:
-      qacc: (V,), acceleration.
-      edge_forces: (C, E) for each group of contacts, force along each edge.
-      constraint_force: (V,), J' times these forces and those of the limits.
-    """
-
-    qacc: jax.Array
+    qacc: jax.Array  # (V,), acceleration.
+    #: (C, E) for each group of contacts, force along each edge.
     edge_forces: tuple[jax.Array, ...]
-    constraint_force: jax.Array
+    constraint_force: jax.Array  # (V,), J' times these forces and those of the limits.
 
 
 class System(Protocol):
@@ -133,20 +110,14 @@ class System(Protocol):
 
     A vector (V numbers a problem) and rows (a number for each row of J) are trees of
     arrays, which only a system looks into.
-
-    Attributes:
-      force: a vector, the problem's.
-      warmstart: a vector, the problem's.
-      reference: rows, aref.
-      weight: rows, D.
-      bound: for each entry of the list of rows, None if these only push, or the largest
-        force of each, or a `Cone`, whose rows are a list of axes.
     """
 
-    force: Any
-    warmstart: Any
-    reference: Any
-    weight: Any
+    force: Any  # A vector, the problem's.
+    warmstart: Any  # A vector, the problem's.
+    reference: Any  # Rows, aref.
+    weight: Any  # Rows, D.
+    #: For each entry of the list of rows, None if these only push, or the largest force
+    #: of each, or a `Cone`, whose rows are a list of axes.
     bound: list[Any]
 
     def inertia_times(self, vector: Any) -> Any:

@@ -13,15 +13,10 @@ from gasil_envs.physics.batching import add, constant_times, stacked, total
 
 
 class Tendons(NamedTuple):
-    """Lengths are `of_qpos` @ qpos, and their rates of change `of_qvel` @ qvel.
+    """Lengths are `of_qpos` @ qpos, and their rates of change `of_qvel` @ qvel."""
 
-    Attributes:
-      of_qpos: (T, nq).
-      of_qvel: (T, V).
-    """
-
-    of_qpos: np.ndarray
-    of_qvel: np.ndarray
+    of_qpos: np.ndarray  # (T, nq).
+    of_qvel: np.ndarray  # (T, V).
 
 
 _JOINT, _SITE = int(mujoco.mjtWrap.mjWRAP_JOINT), int(mujoco.mjtWrap.mjWRAP_SITE)

@@ -42,25 +42,18 @@ _FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 800.0
 
 
 class Kinematics(NamedTuple):
-    """Positions in the world's frame, metres.
+    """Positions in the world's frame, metres."""
 
-    Attributes:
-      columns: rotation of each body.
-      xpos: (N, 3, B), origins of the bodies.
-      xipos: (N, 3, B), their centres of mass.
-      com: (3, B), centre of mass of all bodies that move; of each body's tree if there
-        are several, (N, 3, B).
-      cinert: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass
-        times offset, mass.
-      cdof: (V, 6, B), motion of one unit of each velocity.
-    """
-
-    columns: list[list[jax.Array]]
-    xpos: jax.Array
-    xipos: jax.Array
+    columns: list[list[jax.Array]]  # Rotation of each body.
+    xpos: jax.Array  # (N, 3, B), origins of the bodies.
+    xipos: jax.Array  # (N, 3, B), their centres of mass.
+    #: (3, B), centre of mass of all bodies that move; of each body's tree if there are
+    #: several, (N, 3, B).
     com: jax.Array
+    #: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass times
+    #: offset, mass.
     cinert: jax.Array
-    cdof: jax.Array
+    cdof: jax.Array  # (V, 6, B), motion of one unit of each velocity.
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
@@ -382,17 +375,11 @@ def _sum_up(model: mujoco.MjModel, of_body: jax.Array) -> list[jax.Array]:
 
 
 class Smooth(NamedTuple):
-    """The dynamics without constraints.
+    """The dynamics without constraints."""
 
-    Attributes:
-      inertia: (V, V, B), the joint-space inertia.
-      force: (V, B), passive forces less bias forces.
-      cvel: (N, 6, B), velocity of each body.
-    """
-
-    inertia: jax.Array
-    force: jax.Array
-    cvel: jax.Array
+    inertia: jax.Array  # (V, V, B), the joint-space inertia.
+    force: jax.Array  # (V, B), passive forces less bias forces.
+    cvel: jax.Array  # (N, 6, B), velocity of each body.
 
 
 def velocity(model: mujoco.MjModel, cdof: jax.Array, qvel: jax.Array) -> jax.Array:
