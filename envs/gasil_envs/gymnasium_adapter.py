@@ -84,13 +84,7 @@ def _refuse_forking_caller() -> None:
 
 
 def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
-    """Return an action, or a batch of them, for a step from a state.
-
-    Raises:
-      ResetNeeded: if there is no state yet.
-      ValueError: if the action has another shape than the space, or is no number of a
-        discrete action.
-    """
+    """Return an action, or a batch of them, that a state and a space allow."""
     if state is None:
         raise gymnasium.error.ResetNeeded("step needs a reset before it")
     given = np.asarray(action)
@@ -164,11 +158,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode and return its first observation, (obs,) float32.
-
-        Raises:
-          ValueError: if a `TimeLimit` allows more steps than the environment.
-        """
+        """Start an episode and return its first observation, (obs,) float32."""
         _refuse_fork()
         super().reset(seed=seed)
         self._limits = self._time_limits()
@@ -189,10 +179,6 @@ class GymnasiumEnv(gymnasium.Env):
         """Return observation, reward, terminated, truncated and info.
 
         ``info["true_reward"]`` is the reward without delay, 0 after a reset.
-
-        Raises:
-          ResetNeeded: if there was no reset before.
-          ValueError: if the action has another shape than ``action_space``.
         """
         _refuse_fork()
         given = _checked_action(action, self._state, self.action_space)
@@ -298,10 +284,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Start an episode in each and return the observations, (num_envs, obs).
 
         With ``options={"reset_mask": mask}``, bool (num_envs,), the others go on.
-
-        Raises:
-          ResetNeeded: if a mask is given before any reset.
-          ValueError: if the mask has another shape or type, or no environment is in it.
         """
         _refuse_fork()
         mask = None if options is None else options.get("reset_mask")
@@ -325,10 +307,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Return observation (num_envs, obs), reward, terminated, truncated and info.
 
         Reward, terminated, truncated and the true reward in info are (num_envs,) each.
-
-        Raises:
-          ResetNeeded: if there was no reset before.
-          ValueError: if the actions have another shape than ``action_space``.
         """
         _refuse_fork()
         given = _checked_action(actions, self._state, self.action_space)

@@ -40,10 +40,7 @@ class GymnaxEnv:
     def reset(
         self, key: jax.Array, params: Params | None = None
     ) -> tuple[jax.Array, State]:
-        """Return the first observation, float32 (obs,), and the state.
-
-        The key is consumed.
-        """
+        """Return the first observation, float32 (obs,), and the state."""
         state = self._env.reset(key)
         return state.obs, state
 
@@ -54,20 +51,12 @@ class GymnaxEnv:
         action: jax.Array,
         params: Params | None = None,
     ) -> Transition:
-        """Take a step; if the episode ends, start the next one.
+        """Take a step; if the episode ends, start the next one, with `key`.
 
-        Args:
-          key: key for the start of the next episode; consumed.
-          state: the state before the step.
-          action: float32 (action,), or int32 () where actions are discrete.
-          params: ignored; part of gymnax' interface.
-
-        Returns:
-          Observation, state, reward, terminated, truncated and info. The observation,
-          float32 (obs,), is that of the next episode if this one ended; the last
-          observation of this episode is ``info["final_observation"]``. The reward is
-          float32 (). Terminated and truncated are bool () and never both true.
-          ``info["true_reward"]`` is the reward without delay.
+        Returns observation, state, reward, terminated, truncated (never both) and info.
+        The observation, float32 (obs,), is the next episode's if this one ended, whose
+        last one is ``info["final_observation"]``. ``info["true_reward"]`` is the reward
+        without delay.
         """
         stepped, fresh = self._env.step(state, action), self._env.reset(key)
         ended = stepped.done > 0

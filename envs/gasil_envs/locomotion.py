@@ -389,11 +389,7 @@ INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
 
 
 def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
-    """Return the model in a file or an XML text.
-
-    Raises:
-      ValueError: if MuJoCo can't load it; its message is joined into one line.
-    """
+    """Return the model in a file or an XML text; refuse it in one line."""
     is_text = str(xml).lstrip().startswith("<")
     load = mujoco.MjModel.from_xml_string if is_text else mujoco.MjModel.from_xml_path
     try:
@@ -404,11 +400,7 @@ def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
 
 
 def _start(task: Task, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return qpos and qvel of a task's keyframe, or of its model's rest.
-
-    Raises:
-      ValueError: if the model has no such keyframe.
-    """
+    """Return qpos and qvel of a task's keyframe, or of its model's rest."""
     if task.keyframe is None:
         return model.qpos0, np.zeros(model.nv)
     names = [model.key(i).name for i in range(model.nkey)]

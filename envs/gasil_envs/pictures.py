@@ -28,12 +28,7 @@ class NoOpenGL(RuntimeError):
 class LocomotionPainter:
     """Draws states of locomotion off screen; close it after use.
 
-    Args:
-      env: the task, without wrappers.
-      size: width and height of a picture in pixels.
-
-    Raises:
-      NoOpenGL: if MuJoCo finds no OpenGL.
+    `size` is the width and height of a picture in pixels, here and below.
     """
 
     def __init__(self, env: Locomotion, size: tuple[int, int]):
@@ -100,16 +95,7 @@ class LocomotionPainter:
 
 
 class OwnPainter:
-    """Draws states of an environment that has a function `draw`.
-
-    Args:
-      env: the environment, without wrappers.
-      size: width and height of a picture in pixels.
-
-    Raises:
-      ValueError: from `draw`, if the environment's own fails, or if a picture is no
-        uint8 (height, width, 3).
-    """
+    """Draws states of an environment that has a function `draw`."""
 
     def __init__(self, env: Any, size: tuple[int, int]):
         self._env, self._size = env, size
@@ -136,12 +122,7 @@ class OwnPainter:
 
 
 class PointMassPainter(OwnPainter):
-    """Draws the point mass, its objects and its path.
-
-    Args:
-      env: the point mass, without wrappers.
-      size: width and height of a picture in pixels.
-    """
+    """Draws the point mass, its objects and its path."""
 
     seconds_per_step = 0.1
 
@@ -177,12 +158,7 @@ def can_draw(env: Env) -> bool:
 
 
 def painter(env: Env, size: tuple[int, int]) -> Painter:
-    """Return the painter of an environment, wrapped or not.
-
-    Raises:
-      NoOpenGL: if the environment is a locomotion task and MuJoCo finds no OpenGL.
-      ValueError: if it can't be drawn.
-    """
+    """Return the painter of an environment, wrapped or not."""
     if isinstance(env.unwrapped, Locomotion):
         return LocomotionPainter(env.unwrapped, size)
     if isinstance(env.unwrapped, PointMass):

@@ -38,11 +38,7 @@ def forms() -> tuple[str, ...]:
 
 
 def names(family: str) -> tuple[str, ...]:
-    """Return the names of a family's environments, with its prefix.
-
-    Raises:
-      ValueError: if its package is missing.
-    """
+    """Return the names of a family's environments, with its prefix."""
     module, package = FAMILIES[family]
     with _imported(family, package), warnings.catch_warnings():
         # Such packages warn of others that are absent.
@@ -64,14 +60,7 @@ def _imported(family: str, package: str) -> Iterator[None]:
 
 
 def build(name: str) -> Env:
-    """Build an environment of a family, and trace its functions without running them.
-
-    Args:
-      name: one of `names`.
-
-    Raises:
-      ValueError: if its package fails, or if it gives what can't be trained on.
-    """
+    """Build one of `names`, and trace its functions without running them."""
     family, bare = name.split(":", 1)
     module, package = FAMILIES[family]
     try:

@@ -34,13 +34,9 @@ def is_sound(x: jax.Array) -> jax.Array:
 def step_is_sound(observation: jax.Array, stepped: State) -> jax.Array:
     """Return whether the physics of a step is sound, bool (...).
 
-    The physics has failed if `is_sound` is false for any number in the observations
-    before and after the step, in the reward (given, true or held back), in ``done`` or
-    in the truncation.
-
-    Args:
-      observation: (..., obs), before the step.
-      stepped: the state after the step, (...).
+    It has failed if `is_sound` is false for any number in the observations before and
+    after it, in the reward (given, true or held back), in ``done`` or in the
+    truncation.
     """
     sound = is_sound(observation).all(axis=-1) & is_sound(stepped.obs).all(axis=-1)
     for number in (stepped.reward, stepped.done, *map(stepped.info.get, _OF_STEP)):

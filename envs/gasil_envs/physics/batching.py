@@ -144,12 +144,8 @@ def batch_last(
 ) -> Callable[[Any], Any]:
     """Make `jax.vmap`, nested if needed, extend a trailing batch axis.
 
-    Args:
-      function: from a tree of arrays to a tree of arrays, all with a trailing batch.
-      batched: the same function, to be called under `jax.vmap`; default `function`.
-
-    Returns:
-      The same function of arrays without a batch.
+    `function` is of trees of arrays with a trailing batch, and what is returned of
+    arrays without. `batched` is the same function, to be called under `jax.vmap`.
     """
     function = jax.custom_batching.custom_vmap(function)
     batched = jax.custom_batching.custom_vmap(batched or function)

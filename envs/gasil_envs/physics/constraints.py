@@ -272,13 +272,9 @@ def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
 def motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
     """Return the normal of the plane that contains all motion, or None if none does.
 
-    It is also None if a contact's tangents may be neither in the plane nor across it:
-    the edges of its pyramid are then others. MuJoCo makes tangents of a coordinate axis
-    or of a capsule's axis.
-
-    Args:
-      model: the model.
-      geoms: (C, 2), the geoms of each possible contact; a plane is the first.
+    It is also None if a tangent of one of the contacts (C, 2) may be neither in the
+    plane nor across it: the edges of its pyramid are then others. MuJoCo makes tangents
+    of a coordinate axis or of a capsule's axis.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -628,11 +624,7 @@ def body_forces(
 ) -> jax.Array:
     """Return contacts' torque about `com` and force on each body, (N, 6, B).
 
-    Args:
-      edges: the group's edges.
-      contacts: the group's contacts.
-      com: (3, B), centre of mass of the tree, metres; (N, 3, B) of several trees.
-      edge_forces: (C, E, B), force along each edge.
+    `com` is as in `tree.Kinematics`, and `edge_forces` are (C, E, B).
     """
     (_, position, axes), constants = contacts
     normal, *tangents = np.array(edges, np.float32).T

@@ -32,15 +32,10 @@ class _Simulations(Protocol):
     def step(
         self, inputs: dict[str, np.ndarray], frame_skip: int
     ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Advance all simulations.
+        """Advance all simulations from arrays of the state and "ctrl", (n, ...) each.
 
-        Args:
-          inputs: arrays of the state and "ctrl", (n, ...) each.
-          frame_skip: number of time steps.
-
-        Returns:
-          Arrays of the state and the fields, (n, ...) each, and whether each
-          simulation failed, bool (n,).
+        Return arrays of the state and the fields, and which simulations failed, bool
+        (n,).
         """
 
 

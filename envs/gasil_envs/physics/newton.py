@@ -152,9 +152,9 @@ class System(Protocol):
     ) -> Any:
         """Call a function `least` to `most` times, and return the last carry.
 
-        The function returns the carry and whether something has changed. After `least`
-        calls it need not be called again once nothing changes; a test of that may cost
-        as much as a short function.
+        It returns the carry and whether something has changed. After `least` calls it
+        need not be called again once nothing changes; a test may cost as much as a
+        short function.
         """
 
 
@@ -163,10 +163,8 @@ def weighted_axes(
 ) -> Iterator[jax.Array]:
     """Yield, for each axis, its rows of E' diag(weights) E B of a group of contacts.
 
-    Args:
-      edges: E rows of A signs, as in `ContactRows`.
-      weights: for each edge an array (C, ...); of cones A rows of A such arrays.
-      axes: for each axis an array (C, V, ...), its rows of B.
+    `weights` are an array (C, ...) for each edge, or of cones A rows of A such arrays,
+    and `axes` the rows of B (C, V, ...) of each axis.
     """
     if isinstance(weights[0], list):
         for row in weights:
@@ -309,13 +307,7 @@ _OF_CONES: dict[Any, Callable[..., Any]] = {
 
 
 def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, Any]:
-    """Return the accelerations, a vector, and the forces along the rows.
-
-    Args:
-      system: the problems.
-      iterations: largest number of Newton iterations.
-      line_search: largest number of steps of each line search.
-    """
+    """Return the accelerations, a vector, and the forces along the rows."""
     each = jax.tree.map
     has_cones = any(isinstance(most, Cone) for most in system.bound)
     # A row that bends twice can send a search from one end to the other for ever.

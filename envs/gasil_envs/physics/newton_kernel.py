@@ -157,12 +157,9 @@ class _Block:
     def __init__(self, refs: Any, size: int, groups: Sequence[Any]) -> None:
         """Load a problem.
 
-        Args:
-          refs: references to the inertia, the force and the warm start, the vectors of
-            each of the joints' rows, and for each group to its axes (C, V) and its
-            edges' references, weights and bounds (C,).
-          size: number of degrees of freedom.
-          groups: each group's edges, number of contacts and structure of its bounds.
+        `refs` are the inertia, force and warm start, the vectors of each of the joints'
+        rows, and each group's axes (C, V), references, weights and bounds (C,);
+        `groups` each group's edges, number of contacts and structure of its bounds.
         """
         inertia, vectors, joints, contacts = refs
         self.force, self.warmstart = (_load_vector(ref, size) for ref in vectors)
@@ -330,18 +327,11 @@ def _call(
     warps: int = 1,
     interpret: bool,
 ) -> Any:
-    """Call a kernel for each problem.
+    """Call a kernel for each problem; the first axis of its results is the batch.
 
-    Args:
-      kernel: function of the references to `arrays`, and to each of the results.
-      arrays: tree of arrays whose last axis is the batch.
-      specs: the same tree of specifications of a block's padded part of them.
-      results: specifications of the results; each of them is a whole padded array.
-      warps: number of warps of a block.
-      interpret: run the kernel as XLA's operations, on any device.
-
-    Returns:
-      The results, whose first axis is the batch.
+    `arrays` are a tree whose last axis is the batch, `specs` the same tree of their
+    padded parts that a block has, and `results` the specifications of what it returns.
+    With `interpret` it runs as XLA's operations, on any device.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -431,13 +421,7 @@ def solve_many(
 def eliminate_many(
     matrix: jax.Array, right: jax.Array, *, interpret: bool = False
 ) -> jax.Array:
-    """Return x of A x = b for symmetric positive A: (V, V, B), (V, B) -> (V, B).
-
-    Args:
-      matrix: A.
-      right: b.
-      interpret: run the kernel as XLA's operations, on any device, to test it.
-    """
+    """Return x of A x = b for symmetric positive A: (V, V, B), (V, B) -> (V, B)."""
     size = right.shape[0]
     padded = len(_parts(size)) * WIDTH
     specs = (_spec(padded, padded), _spec(padded))

@@ -29,11 +29,7 @@ def ours_or_mjx(
     iterations: int | None = None,
     ls_iterations: int | None = None,
 ) -> Physics:
-    """Return our physics, or MJX's and a warning that says which part ours lacks.
-
-    Raises:
-      ValueError: if neither takes the model.
-    """
+    """Return our physics, or MJX's and a warning that says which part ours lacks."""
     reason = unsupported(model)
     if reason is None:
         return JaxPhysics(model, fields, iterations, ls_iterations)
