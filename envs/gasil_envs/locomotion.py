@@ -555,7 +555,7 @@ class Locomotion(Env):
 
     def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """Return the state of an episode that starts at qpos (nq,) and qvel (nv,)."""
-        physics = self.physics.init(qpos, qvel)
+        physics = PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
         fields = self.physics.kinematics(physics)
         zero = jnp.float32(0)
         return State(

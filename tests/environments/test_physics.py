@@ -351,9 +351,7 @@ def test_a_model_that_the_small_solver_cant_take_falls_back(integrator, caplog):
     assert falls_back == (integrator == "implicitfast")
     data = mujoco.MjData(model)
     data.qvel[:] = [0.3, 0.0, -0.2, 1.0, 2.0, 3.0]
-    state = physics.init(
-        jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32)
-    )
+    state = PhysicsState(*map(jnp.float32, (data.qpos, data.qvel, 0 * data.qvel)))
     step = jax.jit(lambda state: physics.step(state, jnp.zeros(0), 10)[0])
     state = step(state)
     mujoco.mj_step(model, data, 10)

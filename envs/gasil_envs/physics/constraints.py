@@ -222,8 +222,6 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     both.append(model.tendon_limited.astype(bool) & (span <= 2 * model.tendon_margin))
     if np.concatenate(both).any():
         return "it has joints or tendons whose two limits act at once"
-    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        return "its contact parameters are overridden"
     return collision.unsupported(model, candidates.candidates(model).geoms)
 
 
@@ -260,12 +258,14 @@ def layout(model: mujoco.MjModel) -> Layout:
     return Layout(limits, tuple(groups), friction, others)
 
 
-def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
-    """Return the edges normal +- tangent, for each direction of friction."""
-    if condim == 1:
-        return ((1,),)
-    tangents = np.eye(condim, dtype=int)[1:]
-    edges = [[1, *(sign * x[1:])] for x in tangents for sign in (1, -1)]
+def _edges(condim: int, *, flat: bool, elliptic: bool) -> tuple[tuple[int, ...], ...]:
+    """Return normal +- tangent for each direction of friction, or the axes of cones."""
+    axes = np.eye(2 if flat else condim, dtype=int)
+    if condim == 1 or elliptic:
+        return tuple(tuple(map(int, axis)) for axis in axes)
+    if flat:
+        return _FLAT_PYRAMID
+    edges = [axes[0] + sign * x for x in axes[1:] for sign in (1, -1)]
     return tuple(tuple(map(int, edge)) for edge in edges)
 
 
@@ -311,11 +311,8 @@ def _group(
     motion_normal: np.ndarray | None,
 ) -> Group:
     flat = motion_normal is not None and condim == 3
-    edges = _FLAT_PYRAMID if flat else _pyramid(condim)
     elliptic = _is_elliptic(model) and condim > 1
-    if elliptic:
-        axes = np.eye(2 if flat else condim, dtype=int)
-        edges = tuple(tuple(map(int, axis)) for axis in axes)
+    edges = _edges(condim, flat=flat, elliptic=elliptic)
     chosen = np.flatnonzero(contact.dim == condim)
     pairs, index = collision.pairs(
         model,
@@ -325,9 +322,7 @@ def _group(
     )
     index = chosen[index]
     body = model.geom_bodyid[contact.geoms[index]]
-    moves = np.zeros((model.nbody, model.nv))
-    for i in range(1, model.nbody):
-        moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
+    moves = tree.moves(model)
     is_body = np.eye(model.nbody) * (np.arange(model.nbody) > 0)
 
     def at(x: np.ndarray) -> np.ndarray:

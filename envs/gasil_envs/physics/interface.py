@@ -25,9 +25,6 @@ class Physics(Protocol):
 
     name: str  # jax, mjx or mujoco.
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
-
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""
 

@@ -171,9 +171,6 @@ class MjxPhysics:
                 ", ".join(differs),
             )
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
-
     def _data(self, state: PhysicsState) -> Any:
         return self._blank_data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart

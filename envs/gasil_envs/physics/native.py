@@ -11,7 +11,7 @@ import concurrent.futures
 import itertools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,21 +26,13 @@ from gasil_envs.physics.interface import Fields, PhysicsState
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
-class _Simulations(Protocol):
-    """A fixed number of simulations, for use by one thread at a time."""
-
-    def step(
-        self, inputs: dict[str, np.ndarray], frame_skip: int
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Advance all simulations from arrays of the state and "ctrl", (n, ...) each.
-
-        Return arrays of the state and the fields, and which simulations failed, bool
-        (n,).
-        """
-
-
 class _BatchSimulations:
-    """Simulations with MuJoCo's own `mujoco.batch.Batch`, which returns no fields."""
+    """Simulations with MuJoCo's own `mujoco.batch.Batch`, which returns no fields.
+
+    A step is from arrays of the state and "ctrl", (n, ...) each, to those of the state
+    and the fields, and which simulations failed, bool (n,). One thread uses it at a
+    time.
+    """
 
     def __init__(self, model: mujoco.MjModel, count: int, threads: int):
         self._batch = mujoco.batch.Batch(model, count, threads)
@@ -63,7 +55,7 @@ class _BatchSimulations:
 
 
 class _ThreadedSimulations:
-    """Simulations with a thread and an `mujoco.MjData` for each share of them.
+    """The same with a thread and an `mujoco.MjData` for each share of them.
 
     They return fields, also contact forces, which `Batch` can't: ``cfrc_ext`` needs
     ``mj_rnePostConstraint`` after the step.
@@ -120,6 +112,9 @@ class _ThreadedSimulations:
         return self._results, self._failed
 
 
+_Simulations = _BatchSimulations | _ThreadedSimulations
+
+
 class MujocoPhysics:
     """Steps a MuJoCo model with C MuJoCo; see `interface.Physics`.
 
@@ -152,9 +147,6 @@ class MujocoPhysics:
         # Initial states are computed far more often than they are used, so they are
         # computed without a host call.
         self._place = batch_last(partial(dynamics.kinematics, model, self._fields))
-
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     def kinematics(self, state: PhysicsState) -> Fields:
         return self._place(state)

@@ -6,7 +6,6 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 
 from gasil_envs.physics import dynamics, tree
@@ -89,9 +88,6 @@ class JaxPhysics:
                 "what they move (by friction, impratio or solimp)"
             )
         return parts + tree.rounding(own.model)
-
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:

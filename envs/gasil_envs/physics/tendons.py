@@ -109,9 +109,6 @@ def _site(
     body = model.site_bodyid[site]
     position = at.xpos[body] + tree.rotate(at.columns[body], model.site_pos[site])
     arm = position - (at.com if at.com.ndim == 2 else at.com[body])
-    moves = np.zeros((model.nv, 1, 1), np.float32)
-    while body:
-        moves[model.dof_bodyid == body] = 1.0
-        body = model.body_parentid[body]
+    moves = tree.moves(model)[body, :, None, None].astype(np.float32)
     turned = tree.cross(at.cdof[:, :3], jnp.broadcast_to(arm, at.cdof[:, :3].shape))
     return position, (at.cdof[:, 3:] + turned) * moves

@@ -41,6 +41,14 @@ _NEGLIGIBLE = 1e-9
 _FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 800.0
 
 
+def moves(model: mujoco.MjModel) -> np.ndarray:
+    """Return 1 where a degree of freedom moves a body, else 0, (N, V)."""
+    result = np.zeros((model.nbody, model.nv))
+    for body in range(1, model.nbody):
+        result[body] = result[model.body_parentid[body]] + (model.dof_bodyid == body)
+    return result
+
+
 class Kinematics(NamedTuple):
     """Positions in the world's frame, metres."""
 
