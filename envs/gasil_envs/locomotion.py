@@ -403,15 +403,15 @@ def _start(task: Task, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Return qpos and qvel of a task's keyframe, or of its model's rest."""
     if task.keyframe is None:
         return model.qpos0, np.zeros(model.nv)
-    names = [model.key(i).name for i in range(model.nkey)]
-    if task.keyframe in names:
-        number = names.index(task.keyframe)
-    elif isinstance(task.keyframe, int) and task.keyframe in range(model.nkey):
-        number = task.keyframe
-    else:
-        listed = ", ".join(names) or "none: the model has no keyframes"
-        raise ValueError(f"keyframe is {task.keyframe!r}: it must be one of {listed}")
-    return model.key_qpos[number], model.key_qvel[number]
+    try:
+        keyframe = model.key(task.keyframe)
+    except (KeyError, IndexError):
+        names = ", ".join(model.key(i).name for i in range(model.nkey))
+        raise ValueError(
+            f"keyframe is {task.keyframe!r}: it must be one of "
+            f"{names or 'none: the model has no keyframes'}"
+        ) from None
+    return keyframe.qpos, keyframe.qvel
 
 
 def _with_unit_quaternions(model: mujoco.MjModel, qpos: jax.Array) -> jax.Array:

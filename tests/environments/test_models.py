@@ -101,19 +101,13 @@ MODELS = {
         limited="true"/><geom type="box" size="0.1 0.2 0.05" pos="0.2 0 0" contype="0"
         conaffinity="0"/></body></body>"""
     ),
-    "springs of balls and free joints": arms(
-        world="""<body pos="3 0 0" euler="10 20 30"><joint type="ball" stiffness="3"/>
-        <geom size="0.1" pos="0.1 0 0"/></body><body pos="-3 0 0.5"><joint type="free"
-        stiffness="2"/><geom size="0.1" pos="0 0.1 0"/></body>"""
-    ),
     "joint equality": arms(more=ROW.format('joint1="a" joint2="b"', "0 1.5 0.3 0 0")),
     "held joint": arms(more=ROW.format('joint1="a"', "0.2 0 0 0 0")),
     "tendon": arms(
         actuator="""<motor tendon="t" ctrlrange="-1 1"/>
         <position tendon="t" kp="10" ctrlrange="-1 1"/>""",
         more=TENDON.format(
-            'range="-0.05 0.05" limited="true" stiffness="5" damping="2" '
-            'frictionloss="0.4"'
+            'range="-0.05 0.05" limited="true" stiffness="5" damping="2"'
         ),
     ),
     **{
@@ -128,6 +122,7 @@ MODELS = {
         for flag in (
             *("constraint", "contact", "limit", "equality", "frictionloss"),
             *("spring", "damper", "gravity", "actuation", "clampctrl"),
+            'spring="disable" damper',
         )
     },
     "implicitfast": arms(

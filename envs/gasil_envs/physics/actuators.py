@@ -14,10 +14,7 @@ import numpy as np
 from gasil_envs.physics import tendons, tree
 from gasil_envs.physics.batching import constant_times
 
-_OF_JOINT = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-)
+_OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _OF_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))

@@ -253,7 +253,7 @@ def layout(model: mujoco.MjModel) -> Layout:
     if (loss := model.dof_frictionloss).any():
         solver = model.dof_solref, model.dof_solimp
         friction = Strength.of(model, model.dof_invweight0, solver, loss)
-    kinds = (_equalities, _tendon_friction, _tendon_limits, _ball_limits)
+    kinds = (_equalities, _tendon_limits, _ball_limits)
     others = tuple(rows for kind in kinds if (rows := kind(model)) is not None)
     return Layout(limits, tuple(groups), friction, others)
 
@@ -447,20 +447,6 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     return Strength.of(
         model, weight[first] + weight[second], solver, unbounded
     ), residual
-
-
-def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
-    index = np.flatnonzero(model.tendon_frictionloss)
-    if not index.size:
-        return None
-    of_qvel = tendons.fixed(model).of_qvel[index]
-
-    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
-        return _wide(np.zeros(index.size), qpos), _wide(of_qvel, qpos)
-
-    solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
-    weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
-    return Strength.of(model, weight, solver, loss), residual
 
 
 def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:

@@ -50,9 +50,8 @@ _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
 
 _FLAGS = mujoco.mjtDisableBit
 _EULER, _RK4, _IMPLICITFAST = (
-    mujoco.mjtIntegrator.mjINT_EULER,
-    mujoco.mjtIntegrator.mjINT_RK4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    getattr(mujoco.mjtIntegrator, f"mjINT_{x}")
+    for x in ("EULER", "RK4", "IMPLICITFAST")
 )
 
 
@@ -72,10 +71,15 @@ def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
         _FLAGS.mjDSBL_ACTUATION: ("actuator_gainprm", "actuator_biasprm"),
     }
     disabled = [name for flag, x in names.items() if off & flag for name in x]
+    passive = _FLAGS.mjDSBL_SPRING | _FLAGS.mjDSBL_DAMPER
+    if off & passive == passive:
+        disabled.append("body_gravcomp")
     if disabled or off & _FLAGS.mjDSBL_GRAVITY:
         model = copy.copy(model)
         for name in disabled:
             getattr(model, name)[:] = 0
+        if "body_gravcomp" in disabled:
+            model.opt.density = model.opt.viscosity = 0.0
         if off & _FLAGS.mjDSBL_GRAVITY:
             model.opt.gravity[:] = 0.0
     return model
@@ -192,11 +196,7 @@ def forward(
             for group, x in zip(groups, contacts, strict=True)
         ]
         problem = newton.Problem(
-            smooth.inertia,
-            force,
-            state.qacc_warmstart,
-            tuple(joints),
-            (*rows, *others),
+            smooth.inertia, force, state.qacc_warmstart, tuple(joints), (*rows, *others)
         )
         solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)

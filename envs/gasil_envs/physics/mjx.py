@@ -204,9 +204,7 @@ class MjxPhysics:
     ) -> tuple[PhysicsState, Fields]:
         mjx, data = _mjx(), self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
-            lambda data, _: (mjx.step(self._model, data), None),
-            data,
-            length=frame_skip,
+            lambda data, _: (mjx.step(self._model, data), None), data, length=frame_skip
         )[0]
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         if "cfrc_ext" in self._fields:

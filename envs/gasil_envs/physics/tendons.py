@@ -27,12 +27,13 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     if not np.isin(model.wrap_type, [_JOINT, _SITE]).all():
         return "it has tendons with pulleys or around geoms"
     between = strings(model)
-    pulling = (model.tendon_stiffness, model.tendon_damping, model.tendon_frictionloss)
+    pulling = (model.tendon_stiffness, model.tendon_damping)
     held = model.eq_type == int(mujoco.mjtEq.mjEQ_TENDON)
     if any(x[between].any() for x in pulling) or (between.any() and held.any()):
         return "it has spatial tendons that do more than to limit their length"
-    if model.tendon_armature.any() or model.tendon_actfrclimited.any():
-        return "it has tendons with armature or a limit of the actuators' force"
+    others = (model.tendon_armature, model.tendon_actfrclimited)
+    if any(x.any() for x in (*others, model.tendon_frictionloss)):
+        return "it has tendons with armature, friction or a range of actuators' force"
     return None
 
 

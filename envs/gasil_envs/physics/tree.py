@@ -20,14 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import (
-    add,
-    constant_times,
-    materialize,
-    stacked,
-    take,
-    total,
-)
+from gasil_envs.physics.batching import add, materialize, stacked, take, total
 
 FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -68,14 +61,10 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
     if model.jnt_actgravcomp.any():
         return "it has gravity compensated by actuators"
+    if model.jnt_stiffness[model.jnt_type <= BALL].any():
+        return "it has springs of balls or free joints"
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
         return "it has wind or the ellipsoid model of fluids"
-    flags = mujoco.mjtDisableBit
-    passive = flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER
-    others = model.opt.density > 0 or model.opt.viscosity > 0
-    others = others or model.body_gravcomp.any()
-    if model.opt.disableflags & passive == passive and others:
-        return "its medium or compensation is disabled with its springs and dampers"
     return None
 
 
@@ -420,8 +409,6 @@ def smooth(
     bias = total(cdof * moved[:, 10:], 1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
     scalar = model.jnt_type > BALL
-    for joint in np.flatnonzero(model.jnt_stiffness * ~scalar):
-        passive = passive - _turned_spring(model, int(joint), qpos)
     if model.jnt_stiffness[scalar].any():
         index = model.jnt_qposadr[scalar]
         stretch = (
@@ -436,34 +423,15 @@ def smooth(
     return Smooth(_joint_inertia(model, unit_momentum, cdof), passive - bias, cvel)
 
 
-def _turned_spring(model: mujoco.MjModel, joint: int, qpos: jax.Array) -> jax.Array:
-    """Return minus the force (V, B) of the spring of a free joint or a ball."""
-    first, dof, parts = model.jnt_qposadr[joint], model.jnt_dofadr[joint], []
-    if model.jnt_type[joint] == FREE:
-        rest = model.qpos_spring[first : first + 3].astype(np.float32)
-        parts.append(qpos[first : first + 3] - rest[:, None])
-        first += 3
-    # From the spring's orientation to the joint's.
-    w, x, y, z = model.qpos_spring[first : first + 4]
-    back = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
-    axis, angle = axis_angle(constant_times(back, qpos[first : first + 4]))
-    stretch = jnp.concatenate([*parts, axis * angle])
-    none = jnp.zeros((model.nv, qpos.shape[-1]), jnp.float32)
-    return float(model.jnt_stiffness[joint]) * jnp.concatenate(
-        [none[:dof], stretch, none[dof + len(stretch) :]]
-    )
-
-
 def _joint_inertia(
     model: mujoco.MjModel, unit_momentum: jax.Array, cdof: jax.Array
 ) -> jax.Array:
     """Return the inertia (V, V, B), from the momentum of each unit motion (V, 6, B)."""
     above = np.zeros((model.nv, model.nv, 1), bool)
-    for dof in range(model.nv):
-        ancestor = model.dof_parentid[dof]
-        while ancestor >= 0:
-            above[dof, ancestor] = True
-            ancestor = model.dof_parentid[ancestor]
+    for dof, parent in enumerate(model.dof_parentid):
+        if parent >= 0:
+            above[dof] = above[parent]
+            above[dof, parent] = True
     product = add(unit_momentum[:, None, k] * cdof[None, :, k] for k in range(6))
     product = materialize(product)
     own = np.eye(model.nv, dtype=bool)[..., None]
