@@ -8,7 +8,6 @@ reward, termination, start and frame skip are those of ``gymnasium.envs.mujoco.*
 import dataclasses
 import importlib.util
 import pathlib
-import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -218,150 +217,148 @@ def _start_of_pusher(key: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 #: Gymnasium's tasks by name.
-TASKS: Mapping[str, Task] = types.MappingProxyType(
-    {
-        "hopper": Task(
-            gymnasium_id="Hopper-v5",
-            xml=ASSETS / "hopper.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            healthy_reward=1.0,
-            healthy_z=(0.7, float("inf")),
-            healthy_angle=(-0.2, 0.2),
-            healthy_state=(-100.0, 100.0),
-            max_velocity=10.0,
+TASKS: Mapping[str, Task] = {
+    "hopper": Task(
+        gymnasium_id="Hopper-v5",
+        xml=ASSETS / "hopper.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        healthy_reward=1.0,
+        healthy_z=(0.7, float("inf")),
+        healthy_angle=(-0.2, 0.2),
+        healthy_state=(-100.0, 100.0),
+        max_velocity=10.0,
+    ),
+    "walker2d": Task(
+        gymnasium_id="Walker2d-v5",
+        xml=ASSETS / "walker2d_v5.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        healthy_reward=1.0,
+        healthy_z=(0.8, 2.0),
+        healthy_angle=(-1.0, 1.0),
+        max_velocity=10.0,
+    ),
+    "halfcheetah": Task(
+        gymnasium_id="HalfCheetah-v5",
+        xml=ASSETS / "half_cheetah.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        control_cost=0.1,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+    ),
+    "swimmer": Task(
+        gymnasium_id="Swimmer-v5",
+        xml=ASSETS / "swimmer.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        control_cost=1e-4,
+        reset_noise=0.1,
+        hidden_positions=2,
+    ),
+    "ant": Task(
+        gymnasium_id="Ant-v5",
+        xml=ASSETS / "ant.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        control_cost=0.5,
+        healthy_reward=1.0,
+        healthy_z=(0.2, 1.0),
+        z_index=2,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+        hidden_positions=2,
+        fields=("xpos", "cfrc_ext"),
+        position=_torso_position,
+        observe_more=_clipped_contact_forces,
+        contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
+    ),
+    "humanoid": Task(
+        gymnasium_id="Humanoid-v5",
+        xml=ASSETS / "humanoid.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        forward_reward=1.25,
+        control_cost=0.1,
+        healthy_reward=5.0,
+        healthy_z=(1.0, 2.0),
+        z_index=2,
+        reset_noise=1e-2,
+        hidden_positions=2,
+        fields=("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
+        position=_mass_centre,
+        observe_more=_body_observations,
+        contact_cost=_impact_cost,
+    ),
+    "humanoidstandup": Task(
+        gymnasium_id="HumanoidStandup-v5",
+        xml=ASSETS / "humanoidstandup.xml",
+        frame_skip=5,
+        solver_iterations=8,
+        forward_reward=0.0,
+        control_cost=0.1,
+        healthy_reward=1.0,
+        reset_noise=1e-2,
+        hidden_positions=2,
+        fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
+        observe_more=_body_observations,
+        contact_cost=_impact_cost,
+        # The height over the duration of a time step.
+        reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
+    ),
+    "inverted_pendulum": Task(
+        gymnasium_id="InvertedPendulum-v5",
+        xml=ASSETS / "inverted_pendulum.xml",
+        frame_skip=2,
+        forward_reward=0.0,
+        control_cost=0.0,
+        healthy_reward=1.0,
+        reset_noise=1e-2,
+        hidden_positions=0,
+        healthy=lambda state, fields: jnp.abs(state.qpos[1]) <= 0.2,
+    ),
+    "inverted_double_pendulum": Task(
+        gymnasium_id="InvertedDoublePendulum-v5",
+        xml=ASSETS / "inverted_double_pendulum.xml",
+        frame_skip=5,
+        forward_reward=0.0,
+        control_cost=0.0,
+        healthy_reward=10.0,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+        fields=("xpos", "xipos", "qfrc_constraint"),
+        observe=_observe_poles,
+        reward=_reward_of_poles,
+        healthy=lambda state, fields: _tip(fields)[2] > 1.0,
+    ),
+    "reacher": Task(
+        gymnasium_id="Reacher-v5",
+        xml=ASSETS / "reacher.xml",
+        frame_skip=2,
+        forward_reward=0.0,
+        control_cost=1.0,
+        fields=("xpos",),
+        observe=_observe_reacher,
+        reward=lambda before, after, fields, action: (
+            -jnp.linalg.norm(_to_target(fields))
         ),
-        "walker2d": Task(
-            gymnasium_id="Walker2d-v5",
-            xml=ASSETS / "walker2d_v5.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            healthy_reward=1.0,
-            healthy_z=(0.8, 2.0),
-            healthy_angle=(-1.0, 1.0),
-            max_velocity=10.0,
-        ),
-        "halfcheetah": Task(
-            gymnasium_id="HalfCheetah-v5",
-            xml=ASSETS / "half_cheetah.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            control_cost=0.1,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-        ),
-        "swimmer": Task(
-            gymnasium_id="Swimmer-v5",
-            xml=ASSETS / "swimmer.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            control_cost=1e-4,
-            reset_noise=0.1,
-            hidden_positions=2,
-        ),
-        "ant": Task(
-            gymnasium_id="Ant-v5",
-            xml=ASSETS / "ant.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            control_cost=0.5,
-            healthy_reward=1.0,
-            healthy_z=(0.2, 1.0),
-            z_index=2,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-            hidden_positions=2,
-            fields=("xpos", "cfrc_ext"),
-            position=_torso_position,
-            observe_more=_clipped_contact_forces,
-            contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
-        ),
-        "humanoid": Task(
-            gymnasium_id="Humanoid-v5",
-            xml=ASSETS / "humanoid.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            forward_reward=1.25,
-            control_cost=0.1,
-            healthy_reward=5.0,
-            healthy_z=(1.0, 2.0),
-            z_index=2,
-            reset_noise=1e-2,
-            hidden_positions=2,
-            fields=("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
-            position=_mass_centre,
-            observe_more=_body_observations,
-            contact_cost=_impact_cost,
-        ),
-        "humanoidstandup": Task(
-            gymnasium_id="HumanoidStandup-v5",
-            xml=ASSETS / "humanoidstandup.xml",
-            frame_skip=5,
-            solver_iterations=8,
-            forward_reward=0.0,
-            control_cost=0.1,
-            healthy_reward=1.0,
-            reset_noise=1e-2,
-            hidden_positions=2,
-            fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
-            observe_more=_body_observations,
-            contact_cost=_impact_cost,
-            # The height over the duration of a time step.
-            reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
-        ),
-        "inverted_pendulum": Task(
-            gymnasium_id="InvertedPendulum-v5",
-            xml=ASSETS / "inverted_pendulum.xml",
-            frame_skip=2,
-            forward_reward=0.0,
-            control_cost=0.0,
-            healthy_reward=1.0,
-            reset_noise=1e-2,
-            hidden_positions=0,
-            healthy=lambda state, fields: jnp.abs(state.qpos[1]) <= 0.2,
-        ),
-        "inverted_double_pendulum": Task(
-            gymnasium_id="InvertedDoublePendulum-v5",
-            xml=ASSETS / "inverted_double_pendulum.xml",
-            frame_skip=5,
-            forward_reward=0.0,
-            control_cost=0.0,
-            healthy_reward=10.0,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-            fields=("xpos", "xipos", "qfrc_constraint"),
-            observe=_observe_poles,
-            reward=_reward_of_poles,
-            healthy=lambda state, fields: _tip(fields)[2] > 1.0,
-        ),
-        "reacher": Task(
-            gymnasium_id="Reacher-v5",
-            xml=ASSETS / "reacher.xml",
-            frame_skip=2,
-            forward_reward=0.0,
-            control_cost=1.0,
-            fields=("xpos",),
-            observe=_observe_reacher,
-            reward=lambda before, after, fields, action: (
-                -jnp.linalg.norm(_to_target(fields))
-            ),
-            start=_start_of_reacher,
-            episode_length=50,
-        ),
-        "pusher": Task(
-            gymnasium_id="Pusher-v5",
-            xml=ASSETS / "pusher_v5.xml",
-            frame_skip=5,
-            forward_reward=0.0,
-            control_cost=0.1,
-            fields=("xpos",),
-            observe=_observe_pusher,
-            reward=_reward_of_pusher,
-            start=_start_of_pusher,
-            episode_length=100,
-        ),
-    }
-)
+        start=_start_of_reacher,
+        episode_length=50,
+    ),
+    "pusher": Task(
+        gymnasium_id="Pusher-v5",
+        xml=ASSETS / "pusher_v5.xml",
+        frame_skip=5,
+        forward_reward=0.0,
+        control_cost=0.1,
+        fields=("xpos",),
+        observe=_observe_pusher,
+        reward=_reward_of_pusher,
+        start=_start_of_pusher,
+        episode_length=100,
+    ),
+}
 
 
 class LocomotionState(struct.PyTreeNode):
@@ -374,18 +371,17 @@ class LocomotionState(struct.PyTreeNode):
 #: Physics engines by name: (model, fields, iterations, ls_iterations) -> `Physics`.
 PHYSICS: Mapping[
     str, Callable[[mujoco.MjModel, tuple[str, ...], int | None, int | None], Physics]
-] = types.MappingProxyType(
-    {
-        "jax": ours_or_mjx,
-        "mjx": MjxPhysics,
-        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
-    }
-)
+] = {
+    "jax": ours_or_mjx,
+    "mjx": MjxPhysics,
+    "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+}
 
 #: Integrators by name; "model" is the integrator that the model specifies.
-INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
-    {"model": None, "euler": mujoco.mjtIntegrator.mjINT_EULER}
-)
+INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = {
+    "model": None,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+}
 
 
 def _load(xml: str | pathlib.Path) -> mujoco.MjModel:

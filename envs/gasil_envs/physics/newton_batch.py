@@ -146,9 +146,7 @@ class _Batch:
         result: list[Any] = [sign * vector for sign in self._signs]
         if self._basis is not None:
             along = self._split(_matvec(self._basis, vector, self._spell_out))
-            for edges, axes, has_cones in zip(
-                self._edges, along, self._have_cones, strict=True
-            ):
+            for edges, axes, has_cones in zip(self._edges, along, self._have_cones):
                 rows = [sum_signed(axes, signs) for signs in edges]
                 result.append(rows if has_cones else jnp.stack(rows))
         return result
@@ -180,7 +178,7 @@ class _Batch:
             return result
         weighted: list[jax.Array] = []
         for edges, of_edges, basis in zip(
-            self._edges, of_groups, self._split(self._basis), strict=True
+            self._edges, of_groups, self._split(self._basis)
         ):
             weighted += newton.weighted_axes(edges, of_edges, basis)
         joined = materialize(jnp.concatenate(weighted))

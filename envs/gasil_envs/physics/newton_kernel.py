@@ -173,9 +173,7 @@ class _Block:
         self._inertia = _loads_of_matrix(inertia, size)
         # For each group a list of axes, each a list of parts (C, W).
         self._basis: list[list[list[Load]]] = []
-        for (axes, *of_edges), (_, count, structure) in zip(
-            contacts, groups, strict=True
-        ):
+        for (axes, *of_edges), (_, count, structure) in zip(contacts, groups):
             references, weights, *bound = [
                 [_load(x, count) for x in values] for values in of_edges
             ]
@@ -219,9 +217,7 @@ class _Block:
     def transposed_times(self, rows: list[Any]) -> list[jax.Array]:
         result = _sum(map(_multiply, self.signs, rows))
         of_groups = rows[len(self.signs) :]
-        for edges, axes, of_edges in zip(
-            self._edges, self._basis, of_groups, strict=True
-        ):
+        for edges, axes, of_edges in zip(self._edges, self._basis, of_groups):
             along = [sum_signed(of_edges, signs) for signs in zip(*edges, strict=True)]
             for i in range(len(result)):
                 terms = [
@@ -246,9 +242,7 @@ class _Block:
         for row, entry in zip(matrix, own, strict=True):
             entries = jnp.broadcast_to(entry[:, None], diagonal.shape)
             row[0] = row[0] + jnp.where(diagonal, entries, 0.0)
-        for edges, axes, of_edges in zip(
-            self._edges, self._basis, of_groups, strict=True
-        ):
+        for edges, axes, of_edges in zip(self._edges, self._basis, of_groups):
             for i, row in enumerate(matrix):
                 weighted = newton.weighted_axes(
                     edges, of_edges, [parts[i]() for parts in axes]

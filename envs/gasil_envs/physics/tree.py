@@ -278,9 +278,7 @@ def _inertia(
     local = np.stack(
         [
             _matrix(quaternion) * inertia @ _matrix(quaternion).T
-            for quaternion, inertia in zip(
-                model.body_iquat, model.body_inertia, strict=True
-            )
+            for quaternion, inertia in zip(model.body_iquat, model.body_inertia)
         ]
     ).astype(np.float32)[..., None, None]
     # local is symmetric: row j of (local @ rotation') is the sum over its columns.
