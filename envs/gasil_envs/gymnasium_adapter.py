@@ -112,18 +112,13 @@ def _where(mask: jax.Array, new: Any, old: Any) -> Any:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """A single environment with Gymnasium's interface.
+    """One of `gasil_envs.names()` with Gymnasium's interface.
 
-    Args:
-      name: one of `gasil_envs.names()`.
-      render_mode: "rgb_array" to draw pictures with `render`; default none. The
-        environment variable MUJOCO_GL chooses MuJoCo's OpenGL: egl needs no display.
-      width: width of a picture in pixels.
-      height: height of a picture in pixels.
-      **settings: arguments of `gasil_envs.make`.
-
-    An episode is truncated when it reaches the environment's own step limit, or that of
-    a `gymnasium.wrappers.TimeLimit` around it.
+    With `render_mode` "rgb_array", `render` draws pictures of so many pixels; the
+    environment variable MUJOCO_GL chooses MuJoCo's OpenGL: egl needs no display.
+    `settings` are arguments of `gasil_envs.make`. An episode is truncated when it
+    reaches the environment's own step limit, or that of a
+    `gymnasium.wrappers.TimeLimit` around it.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -232,11 +227,7 @@ class GymnasiumEnv(gymnasium.Env):
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """A batch of environments; the step after an episode's end starts the next one.
 
-    Args:
-      name: one of `gasil_envs.names()`.
-      num_envs: number of environments.
-      render_mode: None; a batch can't be drawn.
-      **settings: arguments of `gasil_envs.make`.
+    `settings` are arguments of `gasil_envs.make`.
     """
 
     metadata = {  # noqa: RUF012

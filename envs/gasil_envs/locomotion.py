@@ -486,10 +486,6 @@ class Locomotion(Env):
         or "mujoco", in C on the host's cores.
       integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
-
-    Raises:
-      ValueError: if the model can't be loaded or does not fit the task, if the physics
-        lacks a part of it, or if a name is unknown.
     """
 
     def __init__(

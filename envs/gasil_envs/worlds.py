@@ -92,9 +92,6 @@ class World:
         shape is that of an action.
       episode_length: number of steps after which an episode is truncated.
       part: name of the part of the observation that is used, if that is a dict.
-
-    Raises:
-      Unfit: if the observation is no array.
     """
 
     #: Draws a state, where the other package can (see `pictures`).

@@ -272,11 +272,10 @@ class ObservationNoise(Wrapper):
 class FaultyStepEnds(Wrapper):
     """End an episode in which the physics fails; for use with other libraries.
 
-    The physics fails if an observation or a reward is not `is_sound`. The step then has
-    reward 0 and the observation of the step before. If the first observation of an
-    episode is not sound, it is replaced by zeros, and the episode ends with its first
-    step. The rollout of `gasil_jax` does the same, but there the observation after a
-    failed step is zeros.
+    The step has reward 0 and the observation of the step before. If an episode's first
+    observation is not sound, it is zeros, and the episode ends with its first step. The
+    rollout of `gasil_jax` does the same, but there the observation after a failed step
+    is zeros.
     """
 
     def reset(self, rng: jax.Array) -> State:

@@ -46,8 +46,6 @@ class Dynamics(NamedTuple):
 _STIFF, _DEEP = 20.0, 0.01
 #: Fields that are about the centre of mass of each body's own tree, with its base.
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
-
-
 _FLAGS = mujoco.mjtDisableBit
 _EULER, _RK4, _IMPLICITFAST = (
     getattr(mujoco.mjtIntegrator, f"mjINT_{x}")

@@ -118,17 +118,9 @@ class Unsupported(ValueError):
 class MjxPhysics:
     """Steps a MuJoCo model with MJX's own step; see `interface.Physics`.
 
-    Args:
-      model: the model; its solver options are overwritten.
-      fields: names of the ``mjData`` arrays to return.
-      iterations: Newton iterations, default 8, or 30 if impratio is above 1.
-      ls_iterations: line-search steps, default 8. Float32 never meets MuJoCo's
-        tolerance, which is meant for float64, so that all of its 100 iterations would
-        run. 4 and 8 give the same result (relative error against C MuJoCo 6e-7 on
-        walker2d).
-
-    Raises:
-      Unsupported: if MJX does not take the model.
+    The model's solver options are overwritten: float32 never meets MuJoCo's tolerance,
+    which is meant for float64, so that all of its 100 iterations would run. 8 and 8, or
+    30 if impratio is above 1, are enough.
     """
 
     name = "mjx"

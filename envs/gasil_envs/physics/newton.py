@@ -269,12 +269,13 @@ def _cone_curvature(d: Any, w: jax.Array, ratio: jax.Array) -> list[list[jax.Arr
     along = [jnp.ones_like(length), *(-ratio * x / length for x in d[1:])]
     # In their direction the tangents' own derivative does not change by `side`.
     lost = jnp.where(held, 0.0, side / (ratio * ratio))
-    rows = [[sliding * x * y for y in along] for x in along]
-    for i, row in enumerate(rows):
-        row[i] = row[i] + (side if i else jnp.where(held, w, 0.0))
-        for j in range(1, len(row)) if i else ():
-            row[j] = row[j] - lost * along[i] * along[j]
-    return rows
+
+    def second(i: int, j: int) -> jax.Array:
+        own = side if i else jnp.where(held, w, 0.0)
+        bend = sliding - lost if i and j else sliding
+        return bend * along[i] * along[j] + (own if i == j else 0.0)
+
+    return [[second(i, j) for j in range(len(d))] for i in range(len(d))]
 
 
 def _cone_rate(d: Any, w: jax.Array, ratio: jax.Array, slope: Any) -> jax.Array:

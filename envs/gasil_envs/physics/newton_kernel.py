@@ -318,8 +318,8 @@ def _call(
     specs: Any,
     results: Any,
     *,
-    warps: int = 1,
     interpret: bool,
+    warps: int = 1,
 ) -> Any:
     """Call a kernel for each problem; the first axis of its results is the batch.
 
@@ -361,10 +361,7 @@ def solve_many(
     *,
     interpret: bool = False,
 ) -> newton.Solution:
-    """Solve a batch of problems as `solver.solve_many` does.
-
-    With `interpret` the kernel runs as XLA's operations, on any device, to test it.
-    """
+    """Solve a batch of problems as `solver.solve_many` does."""
     size = problem.force.shape[0]
     padded = len(_parts(size)) * WIDTH
     joints = list(map(jax.tree.leaves, problem.joints))
@@ -384,20 +381,16 @@ def solve_many(
         _Block,
         size=size,
         groups=[
-            (group.edges, len(group.basis), jax.tree.structure(group.bound))
-            for group in problem.contacts
+            (x.edges, len(x.basis), jax.tree.structure(x.bound))
+            for x in problem.contacts
         ],
     )
     vector = _spec(padded)
+    of_joints = [[vector] * len(rows) for rows in joints]
     qacc, constraint_force, forces = _call(
         functools.partial(_newton, read, iterations, line_search),
         (problem.inertia, [problem.force, problem.warmstart], joints, groups),
-        (
-            _spec(padded, padded),
-            [vector] * 2,
-            [[vector] * len(rows) for rows in joints],
-            of_groups,
-        ),
+        (_spec(padded, padded), [vector] * 2, of_joints, of_groups),
         [vector, vector, of_edges],
         warps=1 << max(0, (entries // _ENTRIES_OF_A_WARP).bit_length() - 1),
         interpret=interpret,

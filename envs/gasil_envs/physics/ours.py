@@ -48,15 +48,9 @@ def ours_or_mjx(
 
 
 class JaxPhysics:
-    """Steps a MuJoCo model with our dynamics and solver; see `interface.Physics`.
+    """Steps a supported model with our dynamics and solver; see `interface.Physics`.
 
-    Args:
-      model: a model that `unsupported` has nothing against.
-      fields: names of the ``mjData`` arrays to return.
-      iterations: largest number of Newton iterations, default 100: it ends where it has
-        converged, mostly after 2 to 8.
-      ls_iterations: largest number of steps of each line search, default 16, or 4 if
-        iterations are given.
+    Newton's method ends where it has converged, mostly after 2 to 8 iterations.
     """
 
     name = "jax"
