@@ -22,14 +22,15 @@ from experiments.curves import Curve, Figure
 from experiments.engine import Setup
 from experiments.figure_results import Results
 from experiments.figures import FIGURES
-from experiments.options import Options, Parser, at_least, shard
 from experiments.search import PaperSearch
 from experiments.store import RESULTS, Store
+from gasil_jax.cli.parsing import check_minimum, read
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.host.runs import Run
+from gasil_jax.host.sweep import parse_shard
 
-#: Commands other than figures: each module has a `parser` and a `run`.
+#: Commands other than figures: each module has `Options` and a `run` that takes them.
 COMMANDS: Mapping[str, ModuleType] = {
     "report": report,
     "benchmark": benchmark,
@@ -41,53 +42,25 @@ COMMANDS: Mapping[str, ModuleType] = {
 _QUICK_STEPS = 100_000
 
 
-def _parser(name: str) -> Parser:
-    """Return the reader of a figure's options."""
-    parser = Parser(name, "Train the runs that a figure lacks, then draw them.")
-    add = parser.add_argument
-    add(
-        "--quick",
-        action="store_true",
-        help="train a small version below the folder of --runs: three seeds of the "
-        "first panel, or of those of --only, for 100,000 steps each",
-    )
-    add("--list", action="store_true", help="only print the missing runs")
-    add(
-        "--only",
-        nargs="+",
-        default=(),
-        help="panels and searches to train, instead of all. A panel without its "
-        "searches trains only what complete searches chose",
-    )
-    add(
-        "--shard",
-        type=shard,
-        default="1/1",
-        help="train only this part of the runs, as NUMBER/COUNT",
-    )
-    parser.add_results("folder of the stored runs, in runs/, and of a page")
-    add("--runs", type=pathlib.Path, help="scratch folder of the training in progress")
-    add("--resume", action="store_true", help="continue interrupted training")
-    add(
-        "--physics",
-        choices=("jax", "mjx", "mujoco"),
-        help="physics engine of locomotion",
-    )
-    add("--devices", type=at_least(1), help="CPU devices, instead of one per core")
-    add(
-        "--evaluate-episodes",
-        type=at_least(0),
-        help="episodes of each of ten evaluations; runs of a search have none",
-    )
-    add(
-        "--processes",
-        type=at_least(1),
-        help="programs that are trained at once, each in a process on one core",
-    )
-    add("--members", type=at_least(1), help="largest number of runs in a program")
-    add("--commit", help="commit of the code, where there is no repository")
-    parser.set_defaults(**{x.name: x.default for x in dataclasses.fields(Setup)})
-    return parser
+@dataclasses.dataclass(frozen=True)
+class Options(Setup):
+    """Train the runs that a figure lacks, then draw them.
+
+    Attributes:
+      quick: train a small version below the folder of --runs: three seeds of the first
+        panel, or of those of --only, for 100,000 steps each.
+      list: only print the missing runs.
+      only: panels and searches to train, instead of all. A panel without its searches
+        trains only what complete searches chose.
+      shard: train only this part of the runs, as NUMBER/COUNT.
+      results: folder of the stored runs, in runs/, and of a page.
+    """
+
+    quick: bool = False
+    list: bool = False
+    only: tuple[str, ...] = ()
+    shard: str = "1/1"
+    results: pathlib.Path = RESULTS
 
 
 def _selected(figure: Figure, names: Sequence[str]) -> Figure:
@@ -136,10 +109,9 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
 
 def _train(name: str, options: Options) -> None:
     """Train the runs that a figure lacks, then draw them."""
-    setup = Setup(
-        **{x.name: getattr(options, x.name) for x in dataclasses.fields(Setup)}
-    )
-    results, figure = options.results, FIGURES[name]
+    check_minimum(options, devices=1, evaluate_episodes=0, processes=1, members=1)
+    setup, results, figure = options, options.results, FIGURES[name]
+    shard = parse_shard(options.shard)
     if options.quick:
         if results.resolve() != RESULTS.resolve():
             raise InputError(
@@ -161,7 +133,7 @@ def _train(name: str, options: Options) -> None:
         """Return the store of the figure's runs, and the runs that it lacks."""
         stored, searched = stores()
         requested = chosen.requested(searched)
-        return stored, stored.missing(engine.select_by_key(requested, *options.shard))
+        return stored, stored.missing(engine.select_by_key(requested, *shard))
 
     while True:
         stored, missing = lacking()
@@ -195,13 +167,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name, *rest = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
     if name in ("-h", "--help"):
         print("python -m experiments NAME (--help for its options)\n")
-        about = {x: str(one.parser().description) for x, one in COMMANDS.items()}
+        docs = {x: one.Options.__doc__ or "" for x, one in COMMANDS.items()}
+        about = {x: words.partition("\n")[0] for x, words in docs.items()}
         for listed, title in ({x: y.title for x, y in FIGURES.items()} | about).items():
             print(f"  {listed:20} {title.removesuffix('.')}")
     elif name in FIGURES:
-        _train(name, _parser(name).parse_args(rest))
+        _train(name, read(Options, rest, f"experiments {name}"))
     elif name in COMMANDS:
-        COMMANDS[name].run(COMMANDS[name].parser().parse_args(rest))
+        module = COMMANDS[name]
+        module.run(read(module.Options, rest, f"experiments {name}"))
     else:
         raise InputError(unknown("experiment", name, (*FIGURES, *COMMANDS)))
     return 0

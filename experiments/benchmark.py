@@ -22,8 +22,8 @@ import importlib.util
 import multiprocessing
 import os
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -32,17 +32,19 @@ from jax.sharding import PartitionSpec as P
 
 import gasil_envs
 from experiments import measured
-from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from gasil_envs import wrappers
 from gasil_jax import checks, presets
 from gasil_jax.algorithms import Algorithm
-from gasil_jax.cli.parsing import input_checked
+from gasil_jax.cli.parsing import check_minimum, input_checked
+from gasil_jax.errors import InputError, unknown
 from gasil_jax.host import driver
 from gasil_jax.host.environments import Settings, available_cores, prepare
 from gasil_jax.host.members import make_members
 
-VARIANTS = {
+Table = Literal["physics", "training", "scaling"]
+Variant = Literal["mjx", "ours", "mujoco", "ours-euler", "mujoco-euler"]
+VARIANTS: Mapping[str, Mapping[str, str]] = {
     "mjx": {"physics": "mjx"},
     "ours": {},
     "mujoco": {"physics": "mujoco"},
@@ -54,29 +56,33 @@ _NUM_STEPS, _BASELINE_STEPS = 20, 3 * 2048
 _FLAGS = os.environ.get("XLA_FLAGS", "")
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options."""
-    about = "Measure the speed and fidelity of physics and training."
-    parser, whole = Parser("benchmark", about), at_least(1)
-    add = parser.add_argument
-    for name, choices, default, words in (
-        ("tables", TABLES, ["physics", "training"], "tables to print"),
-        ("envs", TASKS, ["walker2d"], "tasks"),
-        ("variants", VARIANTS, [], "ways of building a task, instead of the table's"),
-    ):
-        add(f"--{name}", nargs="+", choices=choices, default=default, help=words)
-    words = "numbers of environments in the physics table"
-    add("--num-envs", type=whole, nargs="+", default=[64], help=words)
-    for name, number, words in (
-        ("repeats", 5, "times that each row is timed"),
-        ("devices", None, "CPU devices, instead of one per core"),
-        ("seeds", 10, "seeds to train; in the scaling table on each device"),
-        ("training-envs", None, "environments per seed, instead of the preset's"),
-        ("iterations", 2, "iterations in a repeat"),
-    ):
-        add(f"--{name}", type=whole, default=number, help=words)
-    parser.add_page()
-    return parser
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure the speed and fidelity of physics and training.
+
+    Attributes:
+      tables: tables to print.
+      envs: locomotion tasks.
+      variants: ways of building a task, instead of the table's.
+      num_envs: numbers of environments in the physics table.
+      repeats: times that each row is timed.
+      devices: CPU devices, instead of one per core.
+      seeds: seeds to train; in the scaling table on each device.
+      training_envs: environments per seed, instead of the preset's.
+      iterations: iterations in a repeat.
+      page: write it into docs/performance.md too, below the same command.
+    """
+
+    tables: tuple[Table, ...] = ("physics", "training")
+    envs: tuple[str, ...] = ("walker2d",)
+    variants: tuple[Variant, ...] = ()
+    num_envs: tuple[int, ...] = (64,)
+    repeats: int = 5
+    devices: int | None = None
+    seeds: int = 10
+    training_envs: int | None = None
+    iterations: int = 2
+    page: bool = False
 
 
 @dataclasses.dataclass
@@ -429,7 +435,7 @@ def for_page(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
     return head, lines
 
 
-TABLES = {
+TABLES: Mapping[str, Callable[[str, Options], Iterator[list[Row]]]] = {
     "physics": physics_table,
     "training": training_table,
     "scaling": scaling_table,
@@ -438,7 +444,12 @@ TABLES = {
 
 def run(options: Options) -> None:
     """Print the tables."""
-    page = measured.find(parser(), options) if options.page else None
+    whole = ("repeats", "devices", "seeds", "training_envs", "iterations")
+    check_minimum(options, **dict.fromkeys(whole, 1))
+    for env in options.envs:
+        if env not in TASKS:
+            raise InputError(unknown("envs", env, TASKS))
+    page = measured.find("benchmark", options) if options.page else None
     start_jax(options.devices or available_cores())
     print(measured.machine())
     versions = driver.versions()

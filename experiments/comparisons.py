@@ -306,10 +306,10 @@ def over_tasks(name: str, scores: Sequence[np.ndarray]) -> tuple[float, float, f
     most = math.lcm(*map(len, scores))
     rng = generator(name)
     drawn = [
-        [rng.choice(x, len(x)).repeat(most // len(x)) for x in scores]
-        for _ in range(_DRAWS // 10)
+        rng.choice(x, (_DRAWS // 10, len(x))).repeat(most // len(x), axis=1)
+        for x in scores
     ]
-    means = interquartile_mean(np.reshape(drawn, (len(drawn), -1)), axis=1)
+    means = interquartile_mean(np.concatenate(drawn, axis=1), axis=1)
     low, high = np.percentile(means, [2.5, 97.5])
     every = np.concatenate([x.repeat(most // len(x)) for x in scores])
     return float(interquartile_mean(every)), float(low), float(high)

@@ -159,26 +159,35 @@ class Figure:
         return list(dict.fromkeys(x for panel in chosen for x in self.panels[panel]))
 
     def of_kind(self, kind: str = "") -> list[str]:
-        """Return the panels of a kind.
+        """Return the panels of a kind, or the one panel of this name.
 
-        It is "delayed" or "dense", with "raw" behind it for rewards that are not
-        normalized; of sparse tasks "robots" or "navix", and "noisy" for noise on the
-        actions. Without a kind they are all panels, or the sparse ones of no such
+        A kind is "dense" or "delayed" for locomotion, with "100" behind it for a delay
+        that is longer than the usual one and "raw" for rewards that are not normalized,
+        or "others". Of sparse tasks it is "robots" or "navix", and "noisy" for noise on
+        the actions. Without a kind they are all panels, or the sparse ones of no such
         kind.
         """
 
         def words(panel: str) -> set[str]:
-            if self.solved_from is None:
-                delayed, raw, _ = next(iter(self.panels[panel].values())).family
-                return {"delayed" if delayed else "dense", *["raw"] * raw}
+            curve = next(iter(self.panels[panel].values()))
+            delayed, raw, _ = curve.family
             task = panel.removesuffix("_noisy")
+            other = task.startswith(("gymnax:", "point_mass"))
+            dense = self.solved_from is None and not other
             kinds = {
+                "dense": dense and not delayed,
+                "delayed": delayed,
+                f"{curve.reward_delay}": curve.reward_delay > DELAY,
+                "raw": raw,
+                "others": other,
                 "robots": task in SPARSE_ROBOTS,
                 "navix": task.startswith("navix:"),
+                "noisy": task != panel,
             }
-            kinds["noisy"] = task != panel
             return {x for x, holds in kinds.items() if holds}
 
+        if kind in self.panels:
+            return [kind]
         of_all = not kind and self.solved_from is None
         return [x for x in self.panels if of_all or words(x) == set(kind.split())]
 
@@ -190,25 +199,19 @@ class Figure:
         value = {**vars(curve), **curve.changes}[self.over[0]]
         return name.replace(f"-{value}", "", 1), value
 
-    def rival(self, panel: str, name: str) -> str | None:
-        """Return the favourite's curve at the x value of a curve, or None."""
-        point = (self.favourite, self.point_of(panel, name)[1])
-        curves = (x for x in self.panels[panel] if self.point_of(panel, x) == point)
-        return next((x for x in curves if x != name), None)
-
     def compared(self) -> Comparisons:
         """Return all comparisons of the figure."""
         if self.comparisons is not None:
             return self.comparisons
         compared: dict[tuple[str, ...], Terms] = {}
         for panel, curves in self.panels.items():
-            pairs = [(self.rival(panel, name), name) for name in curves]
-            if self.pairs:
-                pairs = [pair for pair in self.pairs if curves.keys() >= {*pair}]
+            pairs = self.pairs or [
+                (self.favourite, name) for name in curves if name != self.favourite
+            ]
             for part in ("", " early") if self.early else ("",):
-                for ours, other in pairs:
-                    if ours is not None:
-                        names = f"{ours}{part}", f"{other}{part}"
+                for pair in pairs:
+                    if curves.keys() >= {*pair}:
+                        names = [f"{name}{part}" for name in pair]
                         compared[panel, *names] = difference(panel, *names)
         return compared
 

@@ -6,6 +6,7 @@ interval, of two standard errors. A delayed reward has the same sum over an epis
 """
 
 import csv
+import dataclasses
 import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -15,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.curves import Figure
-from experiments.options import Options, Parser, at_least
 from experiments.search import TASKS
 from experiments.store import RESULTS
 from gasil_jax import evaluation, rollout
+from gasil_jax.cli.parsing import check_minimum
 from gasil_jax.host import output_file
 from gasil_jax.host.environments import make_env
 
@@ -64,19 +65,20 @@ def of(figure: Figure, panel: str) -> Return | None:
     return stored()[curve.env] if figure.floor else None
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options."""
-    about = (
-        "Measure what zero actions return on the tasks, and write doing_nothing.csv."
-    )
-    one = Parser("doing_nothing", about)
-    words = "episodes of each task"
-    one.add_argument("--episodes", type=at_least(2), default=100, help=words)
-    return one
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure what zero actions return on the tasks, and write doing_nothing.csv.
+
+    Attributes:
+      episodes: episodes of each task.
+    """
+
+    episodes: int = 100
 
 
 def run(options: Options) -> None:
     """Measure all tasks, and write doing_nothing.csv."""
+    check_minimum(options, episodes=2)
     with output_file.atomic(PATH) as partial, partial.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["task", "episodes", *Return._fields])

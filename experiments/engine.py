@@ -17,7 +17,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from multiprocessing import connection
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
@@ -57,7 +57,7 @@ class Setup:
     Attributes:
       runs: scratch folder of the training in progress.
       resume: whether interrupted training in it is continued; otherwise it is refused.
-      physics: physics engine of locomotion, jax, mjx or mujoco.
+      physics: physics engine of locomotion.
       devices: number of CPU devices to shard members over; default one per core.
       evaluate_episodes: episodes of each evaluation during training; 0 for none. Runs
         of a search are not evaluated.
@@ -70,7 +70,7 @@ class Setup:
 
     runs: pathlib.Path = pathlib.Path("runs", "experiments")
     resume: bool = False
-    physics: str = "jax"
+    physics: Literal["jax", "mjx", "mujoco"] = "jax"
     devices: int | None = None
     evaluate_episodes: int = 10
     processes: int = 1

@@ -12,7 +12,6 @@ import numpy as np
 from experiments import comparisons, doing_nothing
 from experiments.comparisons import Comparison, Scores, Sides
 from experiments.curves import Comparisons, Curve, Figure
-from experiments.search import Search
 from experiments.store import Record, Store
 from gasil_jax.host.runs import Run
 from gasil_jax.statistics import interquartile_mean
@@ -100,16 +99,18 @@ class Row(NamedTuple):
 Whole = dict[str, tuple[float, float, float]]
 
 
-@functools.cache
-def unit(env: str, store: Store) -> float | None:
-    """Return what tuned PPO returns with dense rewards, or None if it is not stored."""
-    search = Search(env, "ppo")
-    if (point := search.chosen(store)) is None:
-        return None
-    (runs,) = search.runs([point], range(10))
-    if store.missing(runs):
-        return None
-    return float(interquartile_mean(np.array([store[run].final for run in runs])))
+#: The families of tasks that are aggregated: their kinds, by title.
+FAMILIES: Mapping[str, str] = {
+    "dense": "dense",
+    "delayed by 20 steps": "delayed",
+    "delayed by 100 steps": "delayed 100",
+    "gymnax and point mass": "others",
+    "sparse mazes, grids, car": "",
+    "noisy mazes and grids": "noisy",
+    "sparse robots": "robots",
+    "noisy sparse robots": "robots noisy",
+    "DoorKey": "navix",
+}
 
 
 class Results:
@@ -131,7 +132,9 @@ class Results:
         self.curves: dict[tuple[str, str], CurveResults] = {}
         self.scores: dict[tuple[str, str], np.ndarray] = {}
         self.sooner: dict[tuple[str, str], np.ndarray] = {}
-        self._forests: dict[str, list[Row]] = {}
+        # Pages draw them, list them and name single ones.
+        self._forests: dict[tuple[str, bool], list[Row]] = {}
+        self._wholes: dict[str, Whole] = {}
         for panel, label, curve in figure.curves():
             runs = [run for run in curve.runs(self.searched) if run in store]
             if not runs:
@@ -190,29 +193,53 @@ class Results:
             return False
         return float(interquartile_mean(self.scores[panel, label])) < floor.mean
 
-    def whole(self, panels: Sequence[str]) -> Whole:
-        """Return each complete curve's mean over panels of at least three tasks.
+    def scale(self, env: str) -> tuple[float, float]:
+        """Return the returns on a task that count as 0 and as 1.
 
-        Where tasks are either solved or not, it is the share of seeds. Else a return is
-        divided by what tuned PPO returns on the task with dense rewards. There is no
-        mean of panels that share a task, and none of two curves alone.
+        They are what its curves return at the start of training, and what the best of
+        them returns at the end.
         """
-        figure, whole = self.figure, Whole()
+        own = [x for x in self.curves.values() if x.complete and x.curve.env == env]
+        first = np.array([y.first for x in own for y in x.records.values()])
+        start = float(interquartile_mean(first[np.isfinite(first)]))
+        return start, max(float(interquartile_mean(x.final)) for x in own)
+
+    def whole(self, kind: str = "") -> Whole:
+        """Return each curve's mean over the panels of a kind, if it is complete on all.
+
+        Where tasks are either solved or not, it is the share of seeds, else the
+        interquartile mean of scores, which are returns on `scale`. There is no mean of
+        panels that share a task, and none of two curves alone.
+        """
+        if kind not in self._wholes:
+            whole = self._whole(self.figure.of_kind(kind))
+            self._wholes[kind] = whole if len(whole) > 2 else {}
+        return self._wholes[kind]
+
+    def _whole(self, panels: Sequence[str]) -> Whole:
+        figure, scores, whole = self.figure, self.scores, Whole()
         envs = [next(iter(figure.panels[x].values())).env for x in panels]
-        if figure.over or len(set(envs)) < max(3, len(envs)):
+        if figure.over or len(set(envs)) < len(envs):
             return whole
-        for name in figure.names(panels):
-            if not all((panel, name) in self.scores for panel in panels):
-                continue
-            scores = [self.scores[panel, name] for panel in panels]
-            if figure.solved_from is not None:
-                whole[name] = comparisons.mean_share(scores)
-                continue
-            units = [unit(env, self.searched) for env in envs]
-            relative = [x / u for x, u in zip(scores, units, strict=True) if u]
-            if len(relative) == len(scores):
-                whole[name] = comparisons.over_tasks(name, relative)
-        return whole if len(whole) > 2 else {}
+        names = [
+            name
+            for name in figure.names(panels)
+            if all((p, name) in scores for p in panels)
+        ]
+        if figure.solved_from is not None:
+            return {
+                x: comparisons.mean_share([scores[p, x] for p in panels]) for x in names
+            }
+        scales = [self.scale(env) for env in envs] if names else []
+        for name in names:
+            # Where nothing is learned, there is nothing to be compared.
+            relative = [
+                (scores[panel, name] - start)
+                / (best - start if best > start else np.inf)
+                for panel, (start, best) in zip(panels, scales, strict=True)
+            ]
+            whole[name] = comparisons.over_tasks(name, relative)
+        return whole
 
     def pairs(self, kind: str = "") -> dict[tuple[str, str], list[str]]:
         """Return the pairs that are compared on panels of a kind, each with these."""
@@ -228,34 +255,28 @@ class Results:
         """Whether all panels are of one task, so that returns have one unit."""
         return len({curve.env for *_, curve in self.figure.curves()}) == 1
 
-    def forest(self, kind: str = "") -> list[Row]:
+    def forest(self, kind: str = "", sooner: bool = False) -> list[Row]:
         """Return what is compared on panels of a kind, a row for each pair of curves.
 
         On one task it is the difference of final returns. Over several tasks it is the
         probability of improvement, less one half, or the difference of the shares of
-        seeds that solve a task. These rows are a family of tests. Panels where both
-        curves return less than doing nothing do not count.
+        seeds that solve a task; with `sooner` how often ours solves it sooner, less one
+        half. These rows are a family of tests. Panels where both curves return less
+        than doing nothing do not count.
         """
-        # A page draws them, lists them and names single ones.
-        if kind not in self._forests:
-            self._forests[kind] = self._forest(kind)
-        return self._forests[kind]
+        if (kind, sooner) not in self._forests:
+            self._forests[kind, sooner] = self._forest(kind, sooner)
+        return self._forests[kind, sooner]
 
-    def _forest(self, kind: str) -> list[Row]:
+    def _forest(self, kind: str, sooner: bool) -> list[Row]:
         if self.is_of_one_task:
             return [
                 Row(row_name(*key), one, {}) for key, one in self.comparisons.items()
             ]
         test: Any = comparisons.improvement
-        if self.figure.solved_from is not None:
+        if self.figure.solved_from is not None and not sooner:
             test = comparisons.lead
-        return self._rows(kind, test, self.scores)
-
-    def who_is_sooner(self, kind: str = "") -> list[Row]:
-        """Return `forest`'s rows with how often ours solves a task sooner."""
-        return self._rows(kind, comparisons.improvement, self.sooner)
-
-    def _rows(self, kind: str, test: Any, scores: Scores) -> list[Row]:
+        scores = self.sooner if sooner else self.scores
         pairs, effects = self.pairs(kind), {}
         for pair, panels in pairs.items():
             keys = [(panel, *pair) for panel in panels]
@@ -271,6 +292,33 @@ class Results:
             )
             for pair, one in every.items()
         ]
+
+    def ahead(self, kind: str = "") -> dict[str, Comparison]:
+        """Return how likely a seed of the favourite returns more than another curve's.
+
+        The result is by the other curve. On sparse tasks it is how likely the favourite
+        is sooner.
+        """
+        rows = self.forest(kind, sooner=self.figure.solved_from is not None)
+        by_name, ours = {x.name: x.compared for x in rows}, self.figure.favourite
+        others = {x: row_name("", ours, x) for x in self.figure.names()}
+        return {x: by_name[name] for x, name in others.items() if name in by_name}
+
+
+def families(pages: Sequence[Results]) -> dict[str, tuple[Results, str]]:
+    """Return the families of figures' tasks of which runs are stored, by title."""
+    return {
+        title: (results, kind)
+        for results in pages
+        for title, kind in FAMILIES.items()
+        if (kind or results.figure.solved_from) and results.whole(kind)
+    }
+
+
+def arms(pages: Sequence[Results]) -> list[str]:
+    """Return the names of figures' curves, each once, those first that are shown."""
+    names = [(*one.figure.shown, *one.figure.names()) for one in pages]
+    return list(dict.fromkeys(itertools.chain(*names)))
 
 
 def row_name(panel: str, ours: str, other: str, less: str = "") -> str:

@@ -14,7 +14,7 @@ With ``over=("reward_delay", "delay")`` the second is drawn over the delay.
 
 import functools
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from experiments.curves import (
@@ -47,7 +47,6 @@ from experiments.search import (
     STEPS,
     TASKS,
     PaperSearch,
-    Point,
     Search,
     SecondStage,
     SingleSetting,
@@ -111,106 +110,27 @@ _PARTS = [
     ),
     _adaptive("deviation 1", initial_std=1.0),
 ]
-#: PPO+GASIL with forms of the bonus that don't favour long episodes.
-_LOGIT, _CENTERED = (
-    Arm(f"ppo+gasil ({form})", "ppo+gasil", {"bonus": form})
-    for form in ("logit", "centered")
-)
-_FORMS = (_LOGIT, _CENTERED, "ppo+gasil", "ppo+bonus", "ppo")
+#: PPO+GASIL with a bonus that doesn't favour long episodes.
+_CENTERED = Arm("ppo+gasil (centered)", "ppo+gasil", {"bonus": "centered"})
 _SCALED = Arm("ppo (decomposed, scaled)", "ppo")
-_BEST_MEAN_RANK = Arm("ppo (decomposed, best mean rank)", "ppo")
-_BEST_DECOMPOSED = functools.partial(SingleSetting, decompose_rewards=True)
 
 
-def _by_root(size: int) -> Point:
-    """Return what the preset `scaled` had when most of its settings followed a root."""
-    return {
-        "learning_rate": 1.5e-3 / size,
-        "initial_std": 1 / math.sqrt(size),
-        "gae_lambda": 1 - math.sqrt(size) / 40,
-    }
-
-
-#: PPO on decomposed rewards, and with a network that stays untrained, near 0: then each
-#: step of a window has the same share of its payout.
-_NEVER_TRAINED = {"decomposition_updates": 1, "decomposition_learning_rate": 1e-12}
-_CONTROLS = [
-    _SCALED,
-    Arm("ppo (equal shares, scaled)", "ppo", _NEVER_TRAINED),
-]
-_SEES_PHASE = Arm("ppo (sees the phase, scaled)", "ppo", {"decompose_rewards": False})
 #: The paper's agents without cloning.
 _RIVALS = ("ppo", "ppo+sil", "ppo+gasil")
-
-#: Changes to the preset `scaled`, as functions of an action's dimension, by arm.
-_BY_DIMENSION: Mapping[str, Callable[[int], Point]] = {
-    "by the root": _by_root,
-    "lambda 0.95": lambda size: {**_by_root(size), "gae_lambda": 0.95},
-    "deviation scaled inversely, lambda 0.95": lambda size: {
-        **_by_root(size),
-        "gae_lambda": 0.95,
-        "initial_std": 2 / size,
-    },
-    "lambda and gamma scaled linearly": lambda size: {
-        **_by_root(size),
-        "gae_lambda": max(0.9, 1 - size / 80),
-        "gamma": max(0.99, 1 - size / 800),
-    },
-}
-
-
-def _by_dimension(env: str) -> list[Arm]:
-    size = presets.ACTION_SIZES[env]
-    return [_SCALED, *(Arm(x, "ppo", of(size)) for x, of in _BY_DIMENSION.items())]
-
 
 _on_new_seeds = functools.partial(grid, TASKS, delays=(DELAY,), seeds=20, first_seed=20)
 
 
-def _like_scaled(env: str, arms: Iterable[Arm]) -> list[Arm]:
-    """Return arms of agents without rows in `scaled`, with its settings for PPO."""
-    scaled = presets.scaled(presets.ACTION_SIZES[env], decompose_rewards=True)
-    return [
-        Arm(f"{name} (decomposed, scaled)", agent, {**scaled, **changes})
-        for name, agent, changes in arms
-    ]
-
-
-def _controls(env: str, delay: int) -> Panels:
-    """Return decomposition and its controls on a task, all with the preset `scaled`."""
-    one = functools.partial(
-        grid, (env,), delays=(delay,), panel="{env} delayed {delay}", seeds=20
-    )
-    imitating = _like_scaled(env, [Arm(x, x) for x in _RIVALS[1:]])
-    return joined(
-        [
-            one(_CONTROLS, base="scaled"),
-            one([_SEES_PHASE], base="scaled", settings={"observe_phase": True}),
-            # Their coefficients are the defaults.
-            one(imitating, base=None),
-        ]
-    )
-
-
-_NOT_DECOMPOSED = Arm("ppo (scaled)", "ppo", {"decompose_rewards": False})
 #: The preset `scaled` had these settings when this was trained, and now similar ones.
+_SIZE = presets.ACTION_SIZES["humanoid"]
 _BY_ROOT = Arm(
-    "ppo (decomposed, by the root)", "ppo", _by_root(presets.ACTION_SIZES["humanoid"])
-)
-_LONG_HISTORY = Arm(
-    "ppo (decomposed, scaled, long history)",
+    "ppo (decomposed, by the root)",
     "ppo",
-    {"decomposition_history_episodes": 4},
-)
-#: Delays in steps; 1000 is a whole episode of these tasks.
-_DELAYS = (1, 5, DELAY, 100, 1000)
-_over_delays = functools.partial(grid, panel="{env}", curve="{arm}-{delay}")
-_NOT_CLIPPED = [
-    Arm(f"{agent} (rewards not clipped)", agent, {"reward_clip": 1e9}) for agent in PAIR
-]
-_ADAPTIVE_WITH_AND_WITHOUT = (
-    _adaptive(ADAPTIVE),
-    _adaptive(f"{ADAPTIVE} without imitation", imitation_weight=0.0),
+    {
+        "learning_rate": 1.5e-3 / _SIZE,
+        "initial_std": 1 / math.sqrt(_SIZE),
+        "gae_lambda": 1 - math.sqrt(_SIZE) / 40,
+    },
 )
 _DENSE = (
     "PPO+GASIL improves PPO on most of the tasks, and outperforms PPO+BC and PPO+SIL "
@@ -222,11 +142,6 @@ _DELAYED = (
 )
 
 
-def _usual_delay(env: str, agent: str, delay: int) -> Search:
-    """Return the search with a delay of `DELAY`, whatever the delay is."""
-    return Search(env, agent, DELAY)
-
-
 def _best_rank(env: str, agent: str, delay: int) -> Search:
     """Return the search of one setting for all tasks with a delay of `DELAY`."""
     return SingleSetting(env, agent, DELAY)
@@ -235,14 +150,6 @@ def _best_rank(env: str, agent: str, delay: int) -> Search:
 def _seeds(env: str, delay: int) -> int:
     """Return the number of seeds: more where delayed outcomes are bimodal."""
     return 20 if delay > 1 and env in TASKS[:4] else 10
-
-
-def _delayed(arms: Sequence[Arm | str], base: Any) -> Panels:
-    """Return arms on all delayed tasks, with as many seeds as `_matrix` has."""
-    return joined(
-        grid((env,), arms, (DELAY,), base=base, seeds=_seeds(env, DELAY))
-        for env in TASKS
-    )
 
 
 def _matrix(cells: Iterable[tuple[str, int]] = CELLS) -> Panels:
@@ -558,33 +465,21 @@ _DEEP_SEA: list[Arm | str] = [
 ]
 
 
-def _with_exploration(env: str) -> Panels:
-    """Return the agents that explore on a delayed task, with the preset `scaled`."""
-    exploring = [
-        Arm("ppo+novelty", "ppo+novelty"),
-        Arm("ppo+bc+novelty", "ppo+bc+novelty", _CLONED),
-    ]
-    arms = _like_scaled(env, exploring)
-    return joined(
-        grid((env,), own, (DELAY,), base=base, seeds=20)
-        for own, base in (([_SCALED], "scaled"), (arms, None))
-    )
-
-
 #: One agent with one rule for all tasks, the agent without each of its parts, and PPO
 #: and PPO+NOVELTY with the same rule.
 _ONE = "ppo+gasil+novelty"
-_ONE_ARMS = [
+_ONE_DELAYED = [
     Arm(_ONE, _ONE),
     Arm("without imitation", _ONE, {"alpha": 0.0}),
     Arm("without novelty", _ONE, {"novelty_coefficient": 0.0}),
+    Arm("without decomposition", _ONE, {"decompose_rewards": False}),
     Arm("ppo", "ppo"),
     Arm("ppo+novelty", "ppo+novelty"),
 ]
-_ONE_DELAYED = [
-    *_ONE_ARMS,
-    Arm("without decomposition", _ONE, {"decompose_rewards": False}),
-]
+_ONE_ARMS = [x for x in _ONE_DELAYED if x.name != "without decomposition"]
+#: Beside them, of other figures: agents with what a search chose on the task or, where
+#: rewards are sparse, on all sparse tasks.
+_TUNED = [Arm(f"{agent} (tuned)", agent) for agent in PAIR]
 _GYMNAX = [
     f"gymnax:{name}"
     for name in (
@@ -593,27 +488,24 @@ _GYMNAX = [
     )
 ]
 _DOOR_KEYS = [f"navix:Navix-DoorKey-{size}-v0" for size in ("5x5", "6x6", "8x8")]
+#: No search and no other figure has these seeds.
+_on_own_seeds = functools.partial(grid, seeds=20, first_seed=100)
 
 
 def _one_agent(
     tasks: Iterable[str], delays: Iterable[int] = (1,), total_steps: int = STEPS
 ) -> Panels:
-    """Return the one agent and what it is compared with, all with the rule `scaled`.
-
-    No search and no other figure has its seeds.
-    """
+    """Return the one agent and what it is compared with, all with its rule."""
     # Other tasks than robots have two dimensions, fewer, or discrete actions.
     sizes = presets.ACTION_SIZES
     robots = {env: env.removeprefix("sparse:").removesuffix("_noisy") for env in tasks}
     return joined(
-        grid(
+        _on_own_seeds(
             (env,),
             _ONE_DELAYED if delay > 1 else _ONE_ARMS,
             (delay,),
             base=None,
-            changes=presets.scaled(sizes.get(robot, 2), decompose_rewards=delay > 1),
-            seeds=20,
-            first_seed=100,
+            changes=presets.scaled_with_entropy(sizes.get(robot, 2), delay > 1),
             total_steps=total_steps,
         )
         for env, robot in robots.items()
@@ -701,30 +593,19 @@ FIGURES: Mapping[str, Figure] = {
     "delayed_rewards": Figure(
         "Delayed rewards: PPO on decomposed rewards beside all others",
         "",
-        joined([_matrix(x for x in CELLS if x[1] > 1), _delayed([_SCALED], "scaled")]),
-        favourite="ppo (decomposed)",
-        shown=("ppo", "ppo+sil", "ppo+gasil", "ppo (decomposed)", _SCALED.name),
-    ),
-    "single_setting": Figure(
-        "Delayed rewards: one setting for all tasks beside others tuned on each",
-        "",
         joined(
             [
-                _delayed([_SCALED], "scaled"),
-                grid(TASKS, [_NOT_DECOMPOSED], (DELAY,), base="scaled"),
-                grid(TASKS, [_BEST_MEAN_RANK], (DELAY,), base=_BEST_DECOMPOSED),
-                grid(TASKS, _ADAPTIVE_WITH_AND_WITHOUT, (DELAY,), base=None),
-                _delayed(PAPERS, Search),
+                _matrix(x for x in CELLS if x[1] > 1),
+                *(
+                    grid(
+                        (x,), [_SCALED], (DELAY,), base="scaled", seeds=_seeds(x, DELAY)
+                    )
+                    for x in TASKS
+                ),
             ]
         ),
-        favourite=_SCALED.name,
-    ),
-    "decomposition_controls": Figure(
-        "Delayed rewards: what learning which steps earned a reward is worth",
-        "",
-        joined(_controls(x, delay) for x in TASKS[:4] for delay in (DELAY, 1000)),
-        favourite=_SCALED.name,
-        dropped_pairs=1,  # Decomposition without the next observation.
+        favourite="ppo (decomposed)",
+        shown=("ppo", "ppo+sil", "ppo+gasil", "ppo (decomposed)", _SCALED.name),
     ),
     "scaled_test": Figure(
         "Delayed rewards: the preset scaled on new seeds and on new tasks",
@@ -738,29 +619,6 @@ FIGURES: Mapping[str, Figure] = {
             ]
         ),
         favourite=_SCALED.name,
-    ),
-    "exploration_delayed": Figure(
-        "Delayed rewards: exploration and cloning on top of decomposition",
-        "",
-        joined(map(_with_exploration, TASKS[:4])),
-        favourite=_SCALED.name,
-    ),
-    "action_dimension": Figure(
-        "Delayed rewards: settings that follow the dimension of an action",
-        "",
-        joined(
-            [
-                *(grid((x,), _by_dimension(x), (DELAY,), base="scaled") for x in TASKS),
-                grid(TASKS, ["ppo"], (DELAY,), base=Search),
-            ]
-        ),
-        favourite=_SCALED.name,
-    ),
-    "bonus_forms": Figure(
-        "Delayed rewards: PPO+GASIL without a survival bonus",
-        "",
-        grid(TASKS[:4], _FORMS, (DELAY,), base=Search),
-        favourite=_LOGIT.name,
     ),
     "ppo_values": Figure(
         "The paper's agents with equal settings",
@@ -804,24 +662,6 @@ FIGURES: Mapping[str, Figure] = {
             *((_SCHEDULED.name, x) for x in PAPERS[:-1]),
         ],
         shown=(*PAPERS, _SCHEDULED.name),
-    ),
-    "delays": Figure(
-        "Rewards delayed by 1, 5, 20, 100 steps and the whole episode",
-        "",
-        joined(
-            _over_delays(tasks, arms, delays, base=base, seeds=seeds)
-            for tasks, arms, delays, base, seeds in (
-                (TASKS[:3], PAIR, _DELAYS, _usual_delay, 10),
-                (TASKS[:3], _NOT_CLIPPED, _DELAYS[-1:], _usual_delay, 10),
-                (TASKS[:3], [ADAPTIVE], _DELAYS, "tuned", 5),
-                (TASKS[:3], [_SCALED], _DELAYS, "scaled", 10),
-                # The others' episodes are shorter at first.
-                (("halfcheetah",), [_LONG_HISTORY], _DELAYS[-1:], "scaled", 10),
-            )
-        ),
-        favourite=_SCALED.name,
-        over=("reward_delay", "delay"),
-        shown=(*PAIR, ADAPTIVE, _SCALED.name),
     ),
     "adaptive_ablation": Figure(
         "Adaptive imitation, with each of its parts taken away",
@@ -902,10 +742,17 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent(TASKS, (1, DELAY, 100)),
                 _one_agent(["point_mass", *_GYMNAX]),
+                *(
+                    grid(
+                        (env,), _TUNED, (delay,), base=Search, seeds=_seeds(env, delay)
+                    )
+                    for env, delay in CELLS
+                ),
+                _on_own_seeds(_GYMNAX, [Arm("ppo (gymnax)", "ppo")], base="gymnax"),
             ]
         ),
         favourite=_ONE,
-        shown=[arm.name for arm in _ONE_ARMS],
+        shown=[arm.name for arm in _ONE_DELAYED],
     ),
     "one_agent_sparse": Figure(
         "One agent with one rule for all tasks: sparse rewards",
@@ -914,10 +761,17 @@ FIGURES: Mapping[str, Figure] = {
             [
                 _one_agent([*SPARSE, *_NOISY], total_steps=SPARSE_STEPS),
                 _one_agent([*_ROBOTS, *_DOOR_KEYS]),
+                *(
+                    grid(own, _TUNED, base=SparseSearch, seeds=20, total_steps=steps)
+                    for own, steps in (
+                        ([*SPARSE, *_NOISY], SPARSE_STEPS),
+                        ([*_ROBOTS, *SPARSE_GRIDS], STEPS),
+                    )
+                ),
             ]
         ),
         favourite=_ONE,
-        shown=[arm.name for arm in _ONE_ARMS],
+        shown=[arm.name for arm in _ONE_DELAYED],
         solved_from=solved_from,
     ),
 }

@@ -13,8 +13,8 @@ from typing import Any
 import jax
 
 from experiments import engine
-from experiments.options import Options, Parser
 from experiments.tables import markdown_table
+from gasil_jax.cli.parsing import read
 from gasil_jax.errors import InputError
 from gasil_jax.host import environments, output_file
 
@@ -32,16 +32,16 @@ def machine() -> str:
     return f"{len(devices)} x {devices[0].device_kind}, cores: {cores}"
 
 
-def find(parser: Parser, options: Options) -> re.Match[str]:
+def find(command: str, options: Any) -> re.Match[str]:
     """Return the part of the page that a command with these options writes.
 
     Raises:
       InputError: if the page does not have the command.
     """
     for part in _TABLE.finditer(PAGE.read_text()):
-        if parser.prog.endswith(f" {part[1]}"):
-            if parser.parse_args([*shlex.split(part[2]), "--page"]) == options:
-                return part
+        words = [*shlex.split(part[2]), "--page"]
+        if command == part[1] and read(type(options), words, "") == options:
+            return part
     raise InputError(f"page is set, but {PAGE} has no command with these options")
 
 

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure as Picture
 from matplotlib.patches import Rectangle
 from PIL import Image
 
-from experiments import doing_nothing
-from experiments.comparisons import BELOW
+from experiments import doing_nothing, figure_results
+from experiments.comparisons import BELOW, Comparison
 from experiments.curves import Figure
 from experiments.figure_results import CurveResults, Results, Row, Whole
 from experiments.search import AGENTS
@@ -35,7 +35,7 @@ def curves(results: Results, kind: str = "") -> Picture:
     """
     figure = results.figure
     panels = [x for x in figure.of_kind(kind) if any(k[0] == x for k in results.curves)]
-    lines, whole = _lines(figure), results.whole(panels)
+    lines, whole = _lines(figure), results.whole(kind) if len(panels) > 2 else {}
     count = len(panels) + bool(whole)
     columns = 3 if count in (5, 6, 12) else min(_MOST_COLUMNS, count)
     rows = math.ceil(count / columns)
@@ -48,7 +48,13 @@ def curves(results: Results, kind: str = "") -> Picture:
         axes.set_title(_short(panel), fontsize=9)
         axes.tick_params(labelsize=7)
     if whole:
-        _draw_whole(grid.flat[len(panels)], whole, lines, figure)
+        axes = grid.flat[len(panels)]
+        at = {"transform": axes.get_yaxis_transform(), "fontsize": 6.5, "va": "bottom"}
+        for row, name in enumerate(whole):
+            axes.text(0.02, row - 0.08, name, **at)
+        _draw_whole(axes, whole, [*whole], lines, figure)
+        axes.set(ylim=(len(whole) - 0.5, -0.8), yticks=[])
+        axes.set_title("mean over these tasks", fontsize=9)
     for axes in grid.flat[count:]:
         axes.set_visible(False)
     shares = figure.solved_from is not None
@@ -171,20 +177,53 @@ def _draw_over(results: Results, panel: str, axes: Any, lines: Any) -> None:
     axes.minorticks_off()
 
 
-def _draw_whole(axes: Any, whole: Whole, lines: Any, figure: Figure) -> None:
+def _draw_whole(
+    axes: Any, whole: Whole, names: Sequence[str], lines: Any, figure: Figure
+) -> None:
     """Draw the means over all tasks, a row for each curve, shown as a line or not."""
-    at = {"transform": axes.get_yaxis_transform(), "fontsize": 6.5, "va": "bottom"}
-    for row, (name, (middle, low, high)) in enumerate(whole.items()):
+    for name, (middle, low, high) in whole.items():
         color = lines[name]["color"] if name in lines else "0.6"
         width = 4.0 if name == figure.favourite else 2.0
+        row = names.index(name)
         axes.plot([low, high], [row, row], color=color, linewidth=width)
         axes.plot(middle, row, "o", color=color, markersize=4)
-        axes.text(0.02, row - 0.08, name, **at)
-    axes.set(yticks=[], ylim=(len(whole) - 0.5, -0.8))
     axes.tick_params(axis="x", labelsize=7)
-    axes.set_title("mean over these tasks", fontsize=9)
-    unit = "share of seeds" if figure.solved_from else "return, 1: PPO, dense rewards"
+    unit = "share of seeds" if figure.solved_from else "score"
     axes.set_xlabel(unit, fontsize=8)
+
+
+def families(pages: Sequence[Results]) -> Picture:
+    """Return means over families of tasks, and probabilities of improvement.
+
+    A family has a row for each curve: on the left its mean over the tasks, on the right
+    how likely a seed of the favourite returns more than one of this curve, or solves a
+    sparse task sooner. The color is the corrected verdict on the favourite.
+    """
+    shown, columns = figure_results.families(pages), 3
+    names = figure_results.arms(pages)
+    rows = math.ceil(len(shown) / columns)
+    height = 0.5 + rows * (0.7 + 0.15 * len(names))
+    picture = Picture(figsize=(12.6, height), layout="constrained")
+    grid = picture.subplots(rows, 2 * columns, squeeze=False).reshape(-1, 2)
+    for axes in grid[len(shown) :].flat:
+        axes.set_visible(False)
+    for i, (title, (results, kind)) in enumerate(shown.items()):
+        scores, ahead = grid[i]
+        whole = results.whole(kind)
+        _draw_whole(scores, whole, names, _lines(results.figure), results.figure)
+        against = results.ahead(kind)
+        _draw_rows(ahead, [*against.values()], 0.5, [names.index(x) for x in against])
+        scores.set_title(title, fontsize=9, loc="left")
+        sooner = results.figure.solved_from is not None
+        words = "is sooner" if sooner else "returns more"
+        ahead.set_xlabel(f"{results.figure.favourite} {words}", fontsize=7)
+        for axes in (scores, ahead):
+            axes.set(xlim=(-0.03, 1.03), yticks=range(len(names)))
+            axes.set_ylim(len(names) - 0.5, -0.5)
+            axes.set_yticklabels([] if i % columns or axes is ahead else names)
+            axes.tick_params(axis="y", labelsize=7)
+            axes.grid(axis="x", color="0.92")
+    return picture
 
 
 def forest(results: Results, kind: str = "") -> Picture:
@@ -196,7 +235,7 @@ def forest(results: Results, kind: str = "") -> Picture:
     """
     parts = [results.forest(kind)]
     if results.sooner:
-        parts.append(results.who_is_sooner(kind))
+        parts.append(results.forest(kind, sooner=True))
     rows = parts[0]
     panels = list(dict.fromkeys(x for row in rows for x in row.verdicts))
     label = 0.075 * max((len(row.name) for row in rows), default=1)
@@ -217,7 +256,8 @@ def forest(results: Results, kind: str = "") -> Picture:
                 (0.0, "difference of shares that solve a task"),
                 (0.5, "probability that the first is sooner"),
             )[i]
-        _draw_rows(grid[i], part, null)
+        _draw_rows(grid[i], [row.compared for row in part], null, range(len(part)))
+        grid[i].set_ylim(max(len(part), 2) - 0.5, -0.5)
         grid[i].set_xlabel(text, fontsize=8)
         names = [row.name for row in part] if i == 0 else [""] * len(part)
         grid[i].set_yticks(range(len(part)), names, fontsize=8)
@@ -230,10 +270,11 @@ def forest(results: Results, kind: str = "") -> Picture:
     return picture
 
 
-def _draw_rows(axes: Any, rows: Sequence[Row], null: float) -> None:
+def _draw_rows(
+    axes: Any, rows: Sequence[Comparison], null: float, places: Sequence[int]
+) -> None:
     axes.axvline(null, color="0.3", linewidth=0.8)
-    for y, row in enumerate(rows):
-        one = row.compared
+    for y, one in zip(places, rows, strict=True):
         color = _VERDICTS["not clear" if one.below else one.verdict]
         axes.plot([null + one.low, null + one.high], [y, y], color=color, linewidth=3)
         axes.plot(null + one.middle, y, "o", color=color, markersize=5)
@@ -242,7 +283,6 @@ def _draw_rows(axes: Any, rows: Sequence[Row], null: float) -> None:
                 axes.plot(end, y, "|", color="0.3", markersize=6, markeredgewidth=0.8)
     if null == 0.5:
         axes.set_xlim(-0.03, 1.03)
-    axes.set_ylim(max(len(rows), 2) - 0.5, -0.5)
     axes.tick_params(axis="x", labelsize=7)
     axes.grid(axis="x", color="0.92")
     axes.set_axisbelow(True)

@@ -10,6 +10,7 @@ All seeds are on one device. To measure one CPU core, start it with ``taskset -c
 """
 
 import collections
+import dataclasses
 import pathlib
 import re
 import tempfile
@@ -22,10 +23,9 @@ import numpy as np
 
 import gasil_envs
 from experiments import measured
-from experiments.options import Options, Parser, at_least
 from gasil_envs.registry import Settings
 from gasil_jax import checks, presets
-from gasil_jax.cli.parsing import input_checked
+from gasil_jax.cli.parsing import check_minimum, input_checked
 from gasil_jax.host import devices, tables
 from gasil_jax.host.members import make_members
 
@@ -54,21 +54,27 @@ _CONTROL = ("while", "call", "conditional")
 _KERNEL = "xla_cpu_small_call"
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options."""
-    about = "Measure the time of each part of a training iteration."
-    parser, whole = Parser("profile", about), at_least(1)
-    add = parser.add_argument
-    for name, default in (("env", "walker2d"), ("agent", "ppo+gasil")):
-        add(f"--{name}", default=default, help=f"name of the {name}")
-    add("--preset", default="tuned", help="name of the preset")
-    add("--seeds", type=whole, default=5, help="number of seeds")
-    words = "iterations before the one that is traced"
-    add("--iterations", type=whole, default=10, help=words)
-    words = "times that a whole iteration is timed"
-    add("--repeats", type=whole, default=5, help=words)
-    parser.add_page()
-    return parser
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Measure the time of each part of a training iteration.
+
+    Attributes:
+      env: name of the environment.
+      agent: name of the agent.
+      preset: name of the preset.
+      seeds: number of seeds.
+      iterations: iterations before the one that is traced.
+      repeats: times that a whole iteration is timed.
+      page: write it into docs/performance.md too, below the same command.
+    """
+
+    env: str = "walker2d"
+    agent: str = "ppo+gasil"
+    preset: str = "tuned"
+    seeds: int = 5
+    iterations: int = 10
+    repeats: int = 5
+    page: bool = False
 
 
 def operations(program: str) -> dict[str, str]:
@@ -140,7 +146,8 @@ def trace(call: Any, program: str) -> dict[str, float]:
 
 def run(options: Options) -> None:
     """Print the table."""
-    page = measured.find(parser(), options) if options.page else None
+    check_minimum(options, seeds=1, iterations=1, repeats=1)
+    page = measured.find("profile", options) if options.page else None
     devices.use_devices(Settings(), 1, options.seeds)
     # Otherwise a cached program may have the scopes of an earlier version.
     jax.config.update("jax_compilation_cache_include_metadata_in_key", True)

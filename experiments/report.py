@@ -18,9 +18,8 @@ import numpy as np
 from experiments import claims, plots, tables
 from experiments.agents import OWN
 from experiments.claims import Pages
-from experiments.figure_results import Results
+from experiments.figure_results import Results, families
 from experiments.figures import FIGURES
-from experiments.options import Options, Parser
 from experiments.search import ADAPTIVE, PAIR, PaperSearch, SparseSearch
 from experiments.store import RESULTS, Store
 from gasil_jax import presets
@@ -66,6 +65,8 @@ def value(pages: Pages, name: str, *arguments: str) -> str:
         # The README is two folders above the pictures.
         text = page(pages, note("front")).rstrip()
         return re.sub(r"\]\((\w+\.png)\)", r"](docs/results/\1)", text)
+    if name == "families":
+        return tables.families([pages[x] for x in arguments])
     slot, *rest = arguments or ("",)
     if name not in pages or slot not in tables.SLOTS:
         raise InputError(
@@ -85,8 +86,14 @@ def pictures(pages: Pages, text: str) -> dict[str, Callable[[], plots.Picture]]:
     drawn: dict[str, Callable[[], plots.Picture]] = {}
     for words in _SLOT.findall(text):
         name, slot, *kind = [*shlex.split(words), ""][:3]
+        if name == "families":
+            joined = [pages[x] for x in shlex.split(words)[1:]]
+            if families(joined):
+                path = tables.picture(slot, name)
+                drawn[path] = functools.partial(plots.families, joined)
+            continue
         draw = {"curves": plots.curves, "forest": plots.forest}.get(slot)
-        if draw and pages[name].curves:
+        if draw and tables.is_drawn(pages[name], slot, *kind):
             path = tables.picture(name, slot, *kind)
             drawn[path] = functools.partial(draw, pages[name], *kind)
     return drawn
@@ -183,10 +190,9 @@ def tuned(pages: Pages) -> str:
     return json.dumps(rows, indent=1, sort_keys=True) + "\n"
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options, of which there are none."""
-    about = "Write all pages, plots and presets, and the README's text on results."
-    return Parser("report", about)
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Write all pages, plots and presets, and the README's text on results."""
 
 
 def run(options: Options) -> None:

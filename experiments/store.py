@@ -89,6 +89,12 @@ class Record:
         return float(rows.mean()) if len(rows) else float("nan")
 
     @property
+    def first(self) -> float:
+        """The first mean return of training; NaN if no episode ever ended."""
+        ended = self.episode_return[np.isfinite(self.episode_return)]
+        return float(ended[0]) if len(ended) else float("nan")
+
+    @property
     def final(self) -> float:
         """The mean return over the last tenth of training.
 

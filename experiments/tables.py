@@ -7,11 +7,12 @@ is one of `Figure.of_kind`.
 import csv
 import pathlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import numpy as np
 
-from experiments import doing_nothing
+from experiments import doing_nothing, figure_results
 from experiments.comparisons import BELOW, Comparison, in_words, number
 from experiments.curves import Curve, name_of
 from experiments.figure_results import Results, Row, row_name
@@ -83,20 +84,24 @@ def claim(results: Results) -> str:
 
 def curves(results: Results, kind: str = "") -> str:
     """Return the picture of learning curves, or of final returns over a setting."""
-    return _shown("curves", results, kind, "returns of each agent on each task")
+    if not is_drawn(results, "curves"):
+        return "Not trained yet."
+    words = "returns of each agent on each task"
+    return f"![{words}]({picture(results.name, 'curves', kind)})"
 
 
 def forest(results: Results, kind: str = "") -> str:
     """Return the picture of what is compared, with the numbers folded."""
+    if not is_drawn(results, "forest", kind):
+        return numbers(results, kind)
     words = "differences with their intervals, and the verdict on each task"
-    shown = _shown("forest", results, kind, words)
-    return f"{shown}\n\n{numbers(results, kind)}" if results.curves else shown
+    drawn = f"![{words}]({picture(results.name, 'forest', kind)})"
+    return f"{drawn}\n\n{numbers(results, kind)}"
 
 
-def _shown(slot: str, results: Results, kind: str, words: str) -> str:
-    if not results.curves:
-        return "Not trained yet."
-    return f"![{words}]({picture(results.name, slot, kind)})"
+def is_drawn(results: Results, slot: str, kind: str = "") -> bool:
+    """Return whether there are runs for a picture."""
+    return bool(results.forest(kind) if slot == "forest" else results.curves)
 
 
 def numbers(results: Results, kind: str = "") -> str:
@@ -123,7 +128,7 @@ def numbers(results: Results, kind: str = "") -> str:
     parts = [lacking, markdown_table(head, rows)]
     parts.append(_compared(results.forest(kind), results))
     if results.sooner:
-        parts.append(_compared(results.who_is_sooner(kind), results, sooner=True))
+        parts.append(_compared(results.forest(kind, True), results, sooner=True))
     return folded("Numbers", *parts)
 
 
@@ -201,17 +206,28 @@ def count(results: Results, verdict: str, kind: str, ours: str, *others: str) ->
     return f"{len(holds)} of {len(measured)}"
 
 
-def likely(results: Results, ours: str, other: str) -> str:
+def likely(
+    results: Results, ours: str, other: str, kind: str = "", asked: str = ""
+) -> str:
     """Return how likely a seed of ours returns more than one of the other curve.
 
     It is the row of the forest plot, and its verdict; empty without the curves' runs.
     """
     if not any(key[1:] == (ours, other) for key in results.figure.compared()):
         raise InputError(f"likely has {ours}, {other}: not compared")
-    compared = {row.name: row.compared for row in results.forest()}
+    compared = {row.name: row.compared for row in results.forest(kind)}
     if (one := compared.get(row_name("", ours, other))) is None:
         return ""
-    return f"{_beside(0.5, one, '.2f')}, {one.verdict}"
+    null = 0.0 if results.sooner else 0.5
+    reached = _reached(null + one.middle, asked)
+    return f"{_beside(null, one, '.2f')}, {one.verdict}{reached}"
+
+
+def _reached(value: float, asked: str) -> str:
+    """Return in words whether a number is what was asked, if something was."""
+    if not asked:
+        return ""
+    return ", reached" if value >= float(asked) else ", **not reached**"
 
 
 def below(results: Results, kind: str = "") -> str:
@@ -225,6 +241,17 @@ def below(results: Results, kind: str = "") -> str:
         for x, own in every.items()
         if own and all(one.verdict == BELOW for one in own)
     )
+
+
+def tasks(results: Results, verdict: str, kind: str, ours: str, other: str) -> str:
+    """Return the tasks on which a curve has a verdict against another one."""
+    compared = [
+        (x, results.comparisons.get((x, ours, other)))
+        for x in results.figure.of_kind(kind)
+    ]
+    named = [x for x, one in compared if one and one.verdict == verdict]
+    measured = any(one for _, one in compared)
+    return ", ".join(named) or "none" * measured
 
 
 def foretold(results: Results, *words: str) -> str:
@@ -289,20 +316,55 @@ def grids(results: Results) -> str:
     return markdown_table(["hyperparameter", "grid", "beyond", "agents"], rows)
 
 
-def mean_shares(results: Results, kind: str = "") -> dict[str, float]:
-    """Return the mean share of solving seeds, of curves that are complete on all."""
-    scores, panels = results.scores, results.figure.of_kind(kind)
-    return {
-        name: float(np.mean([scores[p, name].mean() for p in panels]))
-        for name in results.figure.names(panels)
-        if all((p, name) in scores for p in panels)
-    }
+def share(results: Results, kind: str, name: str, asked: str = "") -> str:
+    """Return the mean share of seeds that solve the tasks of a kind, as a percentage.
+
+    It is empty if the curve is not complete on all.
+    """
+    panels = results.figure.of_kind(kind)
+    if not panels:
+        raise InputError(f"share has {kind}: no panels")
+    if not all((panel, name) in results.scores for panel in panels):
+        return ""
+    mean = float(np.mean([results.scores[panel, name].mean() for panel in panels]))
+    return f"{mean:.0%}{_reached(mean, asked)}"
 
 
-def share(results: Results, kind: str, name: str) -> str:
-    """Return one of `mean_shares` as a percentage."""
-    mean = mean_shares(results, kind)
-    return f"{mean[name]:.0%}" if name in mean else ""
+def rule(results: Results, name: str, kind: str) -> str:
+    """Return a table of a curve's settings on the tasks of a kind.
+
+    A row has the tasks that share their settings, of those that are not the defaults.
+    The last one has the agent's own, which are the same on all tasks.
+    """
+    rows: dict[str, list[str]] = {}
+    for panel in results.figure.of_kind(kind):
+        algorithm = _find(results, panel, name).runs(results.searched)[0].algorithm
+        rows.setdefault(point_in_words(changed(algorithm)), []).append(panel)
+    own = {x.name: getattr(algorithm.agent, x.name) for x in fields(algorithm.agent)}
+    rows[point_in_words(own)] = ["the agent's own"]
+    words = [[", ".join(x), words] for words, x in rows.items()]
+    return markdown_table(["tasks", "settings"], words)
+
+
+def families(pages: Sequence[Results]) -> str:
+    """Return the picture of means over families of tasks, with the numbers folded."""
+    shown = figure_results.families(pages)
+    if not shown:
+        return "Not trained yet."
+    names = figure_results.arms(pages)
+    favourite = pages[0].figure.favourite
+    means, ahead = [], []
+    for name in names:
+        whole = [one.whole(kind).get(name) for one, kind in shown.values()]
+        means.append([name, *(in_words(*x, ".2f") if x else "" for x in whole)])
+        against = [one.ahead(kind).get(name) for one, kind in shown.values()]
+        cells = [f"{_beside(0.5, x, '.2f')}, {x.verdict}" if x else "" for x in against]
+        ahead.append([name, *cells])
+    title = f"How likely {favourite} returns more, or solves a sparse task sooner:"
+    parts = [markdown_table(["", *shown], x) for x in (means, ahead)]
+    words = "means over families of tasks, and how likely one agent returns more"
+    drawn = f"![{words}]({picture(pages[0].name, 'families')})"
+    return f"{drawn}\n\n{folded('Numbers', parts[0], title, parts[1])}"
 
 
 #: The functions that slots of a page may name.
@@ -310,6 +372,6 @@ SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(claim, curves, forest, numbers, final, search, apart, count, likely, below),
-        *(foretold, passing, published, grids, share),
+        *(foretold, passing, published, grids, share, tasks, rule),
     )
 }

@@ -5,6 +5,7 @@ Gymnasium. It replaces the package's policy for the task if its score is higher.
 table in docs/data.md is written from the policies.
 """
 
+import dataclasses
 import json
 import pathlib
 from typing import Any
@@ -13,9 +14,8 @@ import numpy as np
 
 from experiments import report, tables
 from experiments.curves import name_of
-from experiments.options import Options, Parser, at_least
 from gasil_jax import npz, numpy_policy
-from gasil_jax.cli.parsing import input_checked
+from gasil_jax.cli.parsing import POSITIONAL, check_minimum, input_checked
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate_in_gymnasium
 from gasil_jax.host import environments, output_file, sweep
@@ -23,14 +23,17 @@ from gasil_jax.host import environments, output_file, sweep
 TABLE = pathlib.Path(__file__).parent.parent / "docs" / "data.md"
 
 
-def parser() -> Parser:
-    """Return the reader of the command's options."""
-    parser = Parser("zoo", "Score runs' best policies and add them to the package's.")
-    words = "folders of finished runs on locomotion tasks"
-    parser.add_argument("runs", nargs="+", type=pathlib.Path, help=words)
-    words = "episodes of each score"
-    parser.add_argument("--episodes", type=at_least(1), default=100, help=words)
-    return parser
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Score runs' best policies and add them to the package's.
+
+    Attributes:
+      runs: folders of finished runs on locomotion tasks.
+      episodes: episodes of each score.
+    """
+
+    runs: tuple[pathlib.Path, ...] = dataclasses.field(metadata=POSITIONAL)
+    episodes: int = 100
 
 
 def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
@@ -111,6 +114,7 @@ def table() -> str:
 
 def run(options: Options) -> None:
     """Add the best policies of runs, and write the table."""
+    check_minimum(options, episodes=1)
     for folder in options.runs:
         print(add(folder, options.episodes, numpy_policy.ZOO), flush=True)
     text = report.fill_blocks(TABLE.read_text(), lambda _: table())

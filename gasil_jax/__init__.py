@@ -6,18 +6,10 @@ is first used, so that `gasil_jax.numpy_policy` needs no JAX.
 
 import contextlib
 import importlib.metadata
-import os
 import sys
 
 import lazy_loader
 
-from gasil_jax.host import interruption
-
-if interruption.runs_as_program(__name__):
-    interruption.quit_during_imports()
-    # XLA reads it on import. Before jaxlib 0.12 it reports an error for each program
-    # that it loads from the cache.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 if sys.platform == "win32":
     raise ImportError("gasil_jax runs on Linux and macOS: on Windows, use WSL")
 with contextlib.suppress(importlib.metadata.PackageNotFoundError):
@@ -26,6 +18,6 @@ with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             "jaxlib 0.10.2 gives wrong numbers on a CPU (jax issue 39103): install "
             "another one, 0.10.1 or 0.12 and later"
         )
-del contextlib, importlib, interruption, os, sys
+del contextlib, importlib, sys
 __version__ = "0.1.0"
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

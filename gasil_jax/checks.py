@@ -40,11 +40,7 @@ def check(env: Any, algorithm: Algorithm) -> None:
 
 
 def check_environment(env: Any) -> None:
-    """Raise `ValueError` if an environment's sizes or states do not fit training.
-
-    The environment is traced, which takes seconds for a large one. The commands do not
-    call this: `make_env` has checked every environment that they name.
-    """
+    """Raise `ValueError` if an environment, which is traced, does not fit training."""
     _check_interface(env)
     *_, innermost = _levels(env)
     # Ours and Brax's need no check.

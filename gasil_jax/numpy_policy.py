@@ -4,23 +4,11 @@
     action = act(observation)
 
 "zoo:NAME" names one of the trained policies that come with the package. The file is an
-``.npz`` of plain arrays; nothing is unpickled:
-
-    seeds (S,)  final_return (S,)  mean, scale (S, obs)  log_std (S, action)
-    kernel_0 (S, obs, width), bias_0 (S, width), kernel_1 ...  low, high (action,)
-    about (), JSON, only in the zoo: see `about`
+``.npz`` of plain arrays, which docs/data.md lists; nothing is unpickled.
 
 An observation is normalized, (x - mean) / scale, and clipped to +-10; every layer but
-the last is followed by tanh; the output is the mean of a Gaussian. Further arrays
-change this:
-
-- policy_components (): the policy is a mixture of that many Gaussians. The output has
-  their means, one after the other, and then the logits of their weights.
-- num_actions (), instead of log_std, low and high: actions are discrete, numbers from 0
-  on. The output is their logits.
-- activation_relu () or activation_swish (): this activation is used instead of tanh.
-- norm_scale_0 (S, width), norm_bias_0, norm_scale_1 ...: layer normalization comes
-  before the activation.
+the last is followed by tanh, or another activation; the output is the mean of a
+Gaussian, the means and logits of a mixture, or the logits of discrete actions.
 """
 
 import json

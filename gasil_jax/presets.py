@@ -1,24 +1,8 @@
 """Presets: settings that runs start from, by environment, agent and reward delay.
 
 A preset has rows, each for an environment and an agent. A row overrides the defaults of
-the settings; a flag overrides a row.
-
-"tuned" has what a search chose for an agent on a task, with the number of environments
-and the normalization of rewards that it ran with; alpha suits only that normalization.
-Which rows are from which search is in docs/running.md. An agent without a row for a
-task starts from the defaults.
-
-"scaled" has one rule for all tasks, of PPO, PPO+NOVELTY and PPO+GASIL+NOVELTY:
-learning rate, exploration and lambda depend on the dimension of an action, which counts
-as two where actions are discrete. Delayed rewards are decomposed. "tuned" has this rule
-for PPO+GASIL+NOVELTY too.
-
-"gymnax" is for discrete actions, such as those of gymnax and navix. It has one setting
-for all tasks and agents: a batch of 32 environments x 64 steps, and an entropy bonus.
-
-"paper" is the paper's own protocol: its batch, one environment x 2,048 steps, and the
-values of its appendix. Of what the appendix searches it has what our search chose on
-each task (docs/results/paper_figures.md). Rewards are normalized.
+the settings; a flag overrides a row. docs/running.md says what each preset is for, and
+from which search its rows are.
 """
 
 import json
@@ -60,7 +44,8 @@ ACTION_SIZES = {
     "reacher": 2,
     "pusher": 7,
 }
-#: The agents that follow the rule "scaled", in any environment; by default the last.
+#: The agents that follow the rule "scaled", in any environment; by default the last,
+#: which also has an entropy bonus.
 RULED = ("ppo", "ppo+novelty", "ppo+gasil+novelty")
 #: The dimension that discrete actions count as, in that rule.
 DISCRETE_SIZE = 2
@@ -108,28 +93,31 @@ def scaled(action_size: int, decompose_rewards: bool) -> Overrides:
     (docs/results/ablations.md): with more dimensions the searches chose a smaller
     learning rate and less exploration, and noise makes returns vary more.
     """
-    share = min(max((action_size - 2) / 6, 0.0), 1.0)
-
-    def between(two: float, eight: float) -> float:
-        return two * (1 - share) + eight * share
-
     return {
         "normalize_rewards": True,
         "decompose_rewards": decompose_rewards,
         "num_envs": 32,
         "gamma": 0.995,
-        "learning_rate": between(7.5e-4, 1e-4),
-        "initial_std": between(0.7, 0.25),
-        "gae_lambda": between(0.975, 0.9),
+        "learning_rate": _between(7.5e-4, 1e-4, action_size),
+        "initial_std": _between(0.7, 0.25, action_size),
+        "gae_lambda": _between(0.975, 0.9, action_size),
     }
 
 
-def _scaled(decompose_rewards: bool) -> Rows:
-    return {
-        (env, agent): scaled(size, decompose_rewards)
-        for agent in RULED
-        for env, size in ACTION_SIZES.items()
-    }
+def scaled_with_entropy(action_size: int, decompose_rewards: bool) -> Overrides:
+    """Return the same with an entropy bonus, the rule of PPO+GASIL+NOVELTY.
+
+    It too falls linearly: from eight dimensions on there is none.
+    """
+    entropy = _between(0.01, 0.0, action_size)
+    row = scaled(action_size, decompose_rewards)
+    return {**row, "entropy_coefficient": entropy}
+
+
+def _between(two: float, eight: float, action_size: int) -> float:
+    """Return a value on the line from two dimensions to eight, and beyond its end."""
+    share = min(max((action_size - 2) / 6, 0.0), 1.0)
+    return two * (1 - share) + eight * share
 
 
 def is_ruled(agent: str, name: str) -> bool:
@@ -149,7 +137,7 @@ PRESETS: Mapping[str, Preset] = {
     "tuned": Preset(
         _searched("dense", _ADAPTIVE), _searched("delayed", ADAPTIVE_DELAYED)
     ),
-    "scaled": Preset(_scaled(decompose_rewards=False), _scaled(decompose_rewards=True)),
+    "scaled": Preset({}, {}),  # a rule, see `scaled`
     "gymnax": Preset({}, {}, every=_GYMNAX),
     "paper": Preset(
         {
@@ -225,14 +213,13 @@ def preset(
                 f"action_size is None: preset {name!r} needs the dimension of {env}'s "
                 "actions, which is env.action_size, or 2 if they are discrete"
             )
-        row = scaled(size, decompose_rewards=reward_delay > 1)
+        rule = scaled_with_entropy if kind.name == RULED[-1] else scaled
+        row = rule(size, reward_delay > 1)
         return Algorithm(kind()).replace(**row)
-    rows = _rows(name, reward_delay)
     lacking = describe_lack(env, kind.name, name, reward_delay=reward_delay)
     if lacking is not None and name != DEFAULT:
-        tasks, agents = (", ".join(dict.fromkeys(x)) for x in zip(*rows))
-        raise ValueError(f"{lacking}: it has {agents} on {tasks}")
-    row = rows.get((env, kind.name), {})
+        raise ValueError(f"{lacking}: it is for {', '.join(RULED)}")
+    row = _rows(name, reward_delay).get((env, kind.name), {})
     return Algorithm(kind()).replace(**{**PRESETS[name].every, **row})
 
 
@@ -242,10 +229,8 @@ def describe_lack(env: str, agent: str, name: str, *, reward_delay: int) -> str 
     if PRESETS[name].every or is_ruled(agent, name) or (env, agent) in rows:
         return None
     rewards = "delayed" if reward_delay > 1 else "dense"
-    return (
-        f"preset {name!r} has nothing for agent {agent!r} on {env} with {rewards} "
-        "rewards"
-    )
+    what = f"agent {agent!r} on {env} with {rewards} rewards"
+    return f"preset {name!r} has nothing for {what}"
 
 
 def _rows(name: str, reward_delay: int) -> Rows:

@@ -4,6 +4,7 @@ import importlib.metadata
 import importlib.util
 import os
 import pathlib
+import runpy
 import shutil
 import subprocess
 import sys
@@ -31,19 +32,12 @@ sys.exit(gasil_jax.run.main({arguments}))
 
 
 def test_the_commands_are_listed(capsys):
-    assert package.main([]) == 0
+    runpy.run_path(package.__file__, run_name="__main__")
     printed = capsys.readouterr().out
-    assert "__init__" not in printed
     for command in package.COMMANDS:
         assert importlib.util.find_spec(f"gasil_jax.{command}")
         (line,) = [x for x in printed.splitlines() if f"gasil_jax.{command} " in x]
         assert len(line.split()) > 4, line
-    assert package.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"{gasil_jax.__version__}\n"
-    assert package.main(["evalute"]) == 2
-    assert "did you mean 'evaluate'?" in capsys.readouterr().err
-    assert package.main(["foo"]) == 2
-    assert "'foo' is unknown: it must be one of run, sweep" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("command", package.COMMANDS)

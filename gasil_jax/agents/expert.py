@@ -1,6 +1,5 @@
 """Load expert trajectories from a file or a Minari data set, for GAIL (paper, 3.2)."""
 
-import importlib
 import pathlib
 from collections.abc import Mapping
 
@@ -28,8 +27,7 @@ def load(source: str) -> tuple[np.ndarray, np.ndarray]:
     """
     form = "an .npz file with arrays 'observation' and 'action'"
     if source.startswith(_MINARI):
-        _require_minari(source)
-        form = "a local data set with arrays as observations and actions"
+        form = "a local data set of arrays, read with gasil_jax[minari]"
     # What is wrong in a data set decides the type of the error.
     try:
         if source.startswith(_MINARI):
@@ -60,18 +58,6 @@ def _numbers(arrays: Mapping[str, np.ndarray], name: str) -> np.ndarray:
     if not np.isfinite(array).all():
         raise ValueError(f"{name} has numbers that aren't finite")
     return array
-
-
-def _require_minari(source: str) -> None:
-    """Raise `ValueError` unless Minari and what it needs for data sets is installed."""
-    try:
-        importlib.import_module("h5py")  # Minari needs it to read a data set.
-        importlib.import_module("minari")
-    except ImportError:
-        raise ValueError(
-            f"expert is {source!r}: it needs the package minari "
-            '(pip install "gasil_jax[minari]")'
-        ) from None
 
 
 def _read_minari(name: str) -> dict[str, np.ndarray]:

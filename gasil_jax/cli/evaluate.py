@@ -82,18 +82,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     policies = options.load(options.seed)
     env, seeds = policies.env, policies.seeds
     if options.gymnasium and not (
-        environments.is_locomotion(env) and env.unwrapped.task.gymnasium_id
+        environments.is_locomotion(env)
+        and env.unwrapped.task.gymnasium_id
+        and env.observation_size == env.unwrapped.observation_size
+        and not options.stochastic
     ):
         raise InputError(
-            "gymnasium is on: the run must be of a locomotion task of Gymnasium"
+            "gymnasium is on: the run must be of a locomotion task of Gymnasium, "
+            "without observe_phase, and stochastic must be off"
         )
-    if options.gymnasium and env.observation_size != env.unwrapped.observation_size:
-        raise InputError(
-            "gymnasium is on: the run must be without observe_phase, which Gymnasium's "
-            "observations lack"
-        )
-    if options.gymnasium and options.stochastic:
-        raise InputError("gymnasium is on: stochastic must be off")
     if not options.gymnasium:
         resources.check_episodes(env, options.episodes, len(seeds), jax.devices()[:1])
     if options.out is not None:

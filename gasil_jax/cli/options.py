@@ -14,7 +14,7 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.cli import parsing
 from gasil_jax.cli.parsing import Parser, check_minimum, input_checked
 from gasil_jax.cli.reporting import HelpShown
-from gasil_jax.config import Config, names
+from gasil_jax.config import Config, names, validate
 from gasil_jax.errors import InputError
 from gasil_jax.host import (
     descriptions,
@@ -22,9 +22,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
-    start,
     sweep,
-    trackers,
 )
 from gasil_jax.host.environments import Settings
 from gasil_jax.host.output_file import note
@@ -57,8 +55,7 @@ class Options:
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
         MODULE:CLASS. Each has its own settings: this help shows those of the one that
-        is named beside it. Several, separated by commas, are trained side by side, each
-        from its own preset: the points of a sweep.
+        is named beside it.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -73,8 +70,6 @@ class Options:
         log may differ. If the folder holds nothing yet, training begins.
       config: the config.json of another run: what it holds is used for all options that
         are not given.
-      init_from: folder of a run, whose best seed's policy, values and normalizer of
-        observations training starts from, instead of new ones.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -95,7 +90,6 @@ class Options:
     out: pathlib.Path | None = None
     resume: bool = False
     config: pathlib.Path | None = None
-    init_from: pathlib.Path | None = None
     devices: int | None = None
     rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
@@ -110,8 +104,6 @@ class SweepOptions(Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: number of points to draw from the grid or, without a grid, from the
         ranges of the paper's appendix. The draw's seed is first_seed.
-      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
-        instead of grid and random.
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
         from 1 on. Other processes train the others in the same folder. With --resume it
         continues.
@@ -121,7 +113,6 @@ class SweepOptions(Options):
 
     grid: tuple[str, ...] = ()
     random: int | None = None
-    points_file: pathlib.Path | None = None
     shard: str | None = None
     launcher: Literal["ray"] | None = None
     shards: int | None = None
@@ -139,7 +130,7 @@ def read(
     if "--list-envs" in words:
         print(*environments.names(), sep="\n")
         raise HelpShown(0)
-    first, stored = _first_options(words), None
+    first, stored = _first_options(kind, words), None
     if first.resume:
         if first.out is None:
             raise InputError("resume needs --out and the folder to continue")
@@ -156,38 +147,29 @@ def read(
         if not first.config.is_file():
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
-    every, default = _defaults(kind, first, stored, origin)
+    algorithm, default = _defaults(kind, first, stored, origin)
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
     parser.add_fields(kind, "run", default)
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
-    _add_algorithms(parser, every)
-    values = parser.read(words, _why_not(every[0]))
+    _add_algorithm(parser, algorithm)
+    values = parser.read(words, _why_not(algorithm))
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(words)}
-    switches = [model.switch for model in REWARD_MODELS]
-
-    def changed(algorithm: Algorithm) -> Algorithm:
-        """Return an algorithm with those of the given values that it has."""
-        on_or_off = {x: value for x, value in given.items() if x in switches}
-        algorithm = algorithm.replace(**on_or_off)
-        own = {x: value for x, value in given.items() if x in algorithm.settings}
-        return algorithm.replace(**own)
-
+    # A model of rewards that is off has options too.
+    switches = {x: given[x] for x in _switches(algorithm) if x in given}
     with input_checked():
-        algorithms_ = tuple(map(changed, every))
+        algorithm = algorithm.replace(**switches)
+        own = {x: value for x, value in given.items() if x in algorithm.settings}
+        algorithm = algorithm.replace(**own)
     requested = Sweep(
         options.env,
-        algorithms_[0],
+        algorithm,
         _seeds(options, stored),
-        others=algorithms_[1:],
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
-        start=None if stored is None else stored.start,
     )
-    if options.init_from is not None:
-        requested = dataclasses.replace(requested, start=start.find(options.init_from))
     _check(options, requested)
     if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
         raise InputError(
@@ -200,9 +182,8 @@ def read(
     return options, requested
 
 
-def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
-    """Add an option for each setting; those of several agents have one."""
-    algorithm, *others = every
+def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
+    """Add an option for each setting."""
     agent, own = algorithm.agent, {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
@@ -210,38 +191,26 @@ def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
         parser.add_fields(model, model.switch, own.get(model, model()))
     for each in algorithm.own_models:
         parser.add_fields(type(each), each.name, each, all_shown=True)
-    for other in others:
-        parser.add_fields(type(other.agent), other.agent.name, other.agent)
 
 
-def _first_options(words: Sequence[str]) -> argparse.Namespace:
+def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namespace:
     """Return the options that decide which others there are, and their defaults."""
-
-    def delay(text: str) -> int:
-        try:
-            return max(1, points.whole_number(text))
-        except (ValueError, OverflowError):
-            return 1
-
-    parser = Parser("gasil_jax", "", Options)
-    for name in ("out", "config"):
-        parser.add_argument(f"--{name}", type=pathlib.Path, nargs="?")
-    for name in ("env", "agent", "preset"):
-        parser.add_argument(f"--{name}", nargs="?")
-    parser.add_argument("--rewards", nargs="*")
-    parser.add_argument("--resume", action=argparse.BooleanOptionalAction)
-    parser.add_argument("--reward-delay", nargs="?", type=delay, default=1, const=1)
+    parser = Parser("gasil_jax", "", kind)
+    # None tells that they are not given.
+    deciding = ("env", "agent", "preset", "rewards")
+    parser.add_fields(kind, "run", kind(**dict.fromkeys(deciding)))  # type: ignore[arg-type]
+    parser.add_fields(Settings, "environment")
     return parser.parse_known_args(words)[0]
 
 
 def _defaults(
     kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
-) -> tuple[Sequence[Algorithm], Options]:
-    """Return the agents' algorithms and the options that hold where none are given."""
+) -> tuple[Algorithm, Options]:
+    """Return the algorithm and the options that hold where none are given."""
     if stored is not None:
-        own_models = [model.name for model in stored.algorithm.own_models]
+        own_models = tuple(x.name for x in stored.algorithm.own_models)
         for name, given, own in (
-            ("agent", first.agent, stored.agent),
+            ("agent", first.agent, stored.algorithm.agent.name),
             ("preset", first.preset, stored.preset),
             ("rewards", first.rewards, own_models),
         ):
@@ -250,33 +219,30 @@ def _defaults(
                     f"{origin}, where {name} was {own}, is {given}: leave it "
                     "out or name another one"
                 )
-        return stored.algorithms, kind(
+        return stored.algorithm, kind(
             env=stored.env,
-            agent=stored.agent,
+            agent=stored.algorithm.agent.name,
             preset=stored.preset or presets.DEFAULT,
             seeds=len(stored.seeds),
             first_seed=stored.seeds[0],
-            rewards=tuple(own_models),
+            rewards=own_models,
             **_switches(stored.algorithm),
         )
-    agents = (first.agent or Options.agent).split(",")
-    for name in agents:
-        if agents.count(name) > 1:
-            raise InputError(f"agent has {name!r} twice: name it once")
     with input_checked():
-        every = [_default(name, first) for name in agents]
+        algorithm = _default(first)
     missing: Any = dataclasses.MISSING
-    return every, kind(
+    return algorithm, kind(
         env=missing,
-        agent=",".join(agents),
+        agent=algorithm.agent.name,
         preset=first.preset or presets.DEFAULT,
-        **_switches(every[0]),
+        **_switches(algorithm),
     )
 
 
-def _default(name: str, first: argparse.Namespace) -> Algorithm:
+def _default(first: argparse.Namespace) -> Algorithm:
     """Return the algorithm from which an agent starts."""
-    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
+    agent = descriptions.find_agent(first.agent or Options.agent)
+    preset = first.preset or presets.DEFAULT
     algorithm = Algorithm(agent())
     if first.env is not None:
         algorithm = presets.preset(
@@ -344,33 +310,22 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
     """Return the sweep with the points that the options name."""
     named: Sequence[points.Point] | None = None
     if isinstance(options, SweepOptions):
-        new = bool(options.grid) or options.random is not None
-        if new or options.points_file is not None:
+        if options.grid or options.random is not None:
             named = points.make_points(
                 options.grid,
                 options.random,
-                options.points_file,
                 seed=options.first_seed,
-                algorithms=requested.algorithms,
+                algorithm=requested.algorithm,
             )
-        elif stored is None and not requested.others:
+        elif stored is None:
             raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random, "
-                "--points-file or several agents"
+                "grid is empty: it must be NAME=VALUE,..., or use --random"
             )
     if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
     named = named or [{}]
-    if requested.others:
-        agents = [each.agent.name for each in requested.algorithms]
-        named = [
-            {"agent": agent, **point}
-            for agent in agents
-            for point in named
-            if point.get("agent", agent) == agent
-        ]
-    points.check(named, *requested.algorithms)
-    every = points.completed(named, *requested.algorithms)
+    points.check(named, requested.algorithm)
+    every = points.completed(named, requested.algorithm)
     return dataclasses.replace(requested, points=every)
 
 
@@ -382,17 +337,14 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        for each in requested.algorithms:
-            algorithms.check(each)
-        trackers.check(requested.recording.log)
+        algorithms.check(requested.algorithm)
+        validate(requested.recording)
     check_minimum(options, devices=1)
-    counts = (x for x in names(Recording) if x != "log")
-    check_minimum(requested.recording, **dict.fromkeys(counts, 1))
     check_minimum(requested.settings, max_episode_steps=1)
     if options.out is not None:
+        folders.check_writable(options.out)
         if not options.resume and getattr(options, "shard", None) is None:
             folders.refuse_used(options.out)
-        folders.check_writable(options.out)
 
 
 def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
@@ -411,20 +363,19 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
     """Print a note if the default preset has nothing for the agent and the task."""
-    for each in requested.algorithms:
-        lacking = presets.describe_lack(
-            options.env,
-            each.agent.name,
-            presets.DEFAULT,
-            reward_delay=requested.settings.reward_delay,
-        )
-        default = options.preset == presets.DEFAULT
-        default &= not options.resume and options.config is None
-        if default and lacking is not None:
-            more = ""
-            if environments.is_discrete(env):
-                more = " (--preset gymnax has one setting for discrete actions)"
-            note(f"{lacking}: options that are not given have their defaults{more}")
+    lacking = presets.describe_lack(
+        options.env,
+        requested.algorithm.agent.name,
+        presets.DEFAULT,
+        reward_delay=requested.settings.reward_delay,
+    )
+    default = options.preset == presets.DEFAULT
+    default &= not options.resume and options.config is None
+    if default and lacking is not None:
+        more = ""
+        if environments.is_discrete(env):
+            more = " (--preset gymnax has one setting for discrete actions)"
+        note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

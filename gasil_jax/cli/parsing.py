@@ -30,14 +30,7 @@ POSITIONAL = {"positional": True}
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are `InputError`, one line each.
-
-    Args:
-      program: name of the module that was started.
-      usage: what follows it in the usage line.
-      kind: the dataclass whose docstring says what the command does.
-      shown: names of options that `--help` shows; default all. `--help-all` shows all.
-    """
+    """A parser whose errors are `InputError`; `--help` shows the options `shown`."""
 
     def __init__(
         self,
@@ -122,11 +115,9 @@ class Parser(argparse.ArgumentParser):
                 raise InputError(f"{word!r} is not an option or its value: see --help")
             if (why := why_not(name.removeprefix("no_"))) is not None:
                 raise InputError(f"option {flag} is unknown: {why}")
-            near = _similar(name.removeprefix("no_"), self._names)
-            meant = (
-                f"did you mean --{near.replace('_', '-')}?" if near else "see --help"
-            )
-            raise InputError(f"option {flag} is unknown: {meant}")
+            near = nearest(name.removeprefix("no_"), self._names)
+            meant = f"did you mean --{near.replace('_', '-')}?" if near else ""
+            raise InputError(f"option {flag} is unknown: {meant or 'see --help'}")
         return values
 
     def given(self, words: Sequence[str]) -> list[str]:
@@ -166,20 +157,6 @@ def _default(field: Any) -> Any:
     return field.default
 
 
-def _similar(name: str, names: Sequence[str]) -> str | None:
-    """Return the name that contains, abbreviates to or resembles a word, or None."""
-
-    def singular(word: str) -> str:
-        return word.removesuffix("s")
-
-    for each in names:
-        parts = each.split("_")
-        initials = "".join(word[:1] for word in parts)
-        if singular(name) in map(singular, parts) or name == initials:
-            return each
-    return nearest(name, names)
-
-
 def _as_text(value: Any) -> str:
     if isinstance(value, bool):
         return "on" if value else "off"
@@ -213,7 +190,7 @@ def _of_type(hint: Any) -> dict[str, Any]:
             one["type"] = _number(whole_number, "whole numbers, separated by spaces")
         return {**one, "nargs": "*", "action": _Once}
     if get_origin(hint) is typing.Literal:
-        return {"type": _choice(get_args(hint)), "metavar": "|".join(get_args(hint))}
+        return {"choices": get_args(hint), "metavar": "|".join(get_args(hint))}
     if hint is bool:
         return {"action": argparse.BooleanOptionalAction}
     if hint is int:
@@ -232,16 +209,6 @@ def _number(kind: Callable[[str], Any], what: str) -> Callable[[str], Any]:
         raise argparse.ArgumentTypeError(f"is {text!r}: it must be {what}")
 
     return number
-
-
-def _choice(allowed: Sequence[str]) -> Callable[[str], str]:
-    def choice(text: str) -> str:
-        if text not in allowed:
-            listed = ", ".join(allowed)
-            raise argparse.ArgumentTypeError(f"is {text!r}: it must be one of {listed}")
-        return text
-
-    return choice
 
 
 class _Once(argparse.Action):

@@ -1,6 +1,5 @@
 """Plot one or several runs: ``python -m gasil_jax.plot RUN [RUN ...]``."""
 
-import csv
 import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
@@ -13,13 +12,11 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import folders, output_file, plotting, results, saved, tables
+from gasil_jax.host import output_file, plotting, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
 _STYLES = ("-", "--", "-.", ":")
-#: What may be on the x axis.
-_X = ("env_steps", "iteration", "episodes")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,21 +24,13 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of runs and sweeps, each a curve of its own, and a sweep over agents
-        one for each agent; and another library's CSV files, or folders of them with one
-        for each seed (see columns).
+      runs: folders of runs and sweeps, each a curve of its own.
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
       labels: labels of the runs; default "ENVIRONMENT, AGENT", and the folder of those
         that would look alike.
       metric: column of metrics.csv to draw.
-      smooth: number of the 50 parts of training whose moving mean is drawn.
-      x: what is on the x axis: env_steps, iteration or episodes.
-      columns: of CSV files the columns of x and of the return; "sum:" before a name
-        adds its numbers up. For Stable-Baselines3 "time/total_timesteps
-        rollout/ep_rew_mean" (progress.csv) or "sum:l r" (monitor.csv), for CleanRL
-        "global_step charts/episodic_return".
     """
 
     runs: tuple[pathlib.Path, ...] = dataclasses.field(metadata=POSITIONAL)
@@ -49,17 +38,14 @@ class Options:
     out: pathlib.Path = pathlib.Path("curves.png")
     labels: tuple[str, ...] = ()
     metric: str = "episode_return"
-    smooth: int = 1
-    x: str = "env_steps"
-    columns: tuple[str, ...] = ()
 
 
 class Curves(NamedTuple):
     """The curves of one run."""
 
-    env: str  # the environment's name; empty if a file does not say it
+    env: str  # the environment's name
     label: str  # label in the legend
-    env_steps: np.ndarray  # (points,), or what else is on the x axis
+    env_steps: np.ndarray  # (points,)
     # (seeds, points), mean return of the episodes since the previous point.
     returns: np.ndarray
     final: np.ndarray  # (seeds,), mean return over the last tenth of training
@@ -74,20 +60,19 @@ def read(
     point: int | None = None,
     *,
     metric: str = "episode_return",
-    x: str = "env_steps",
 ) -> Curves:
     """Return the curves of a run, or of a sweep's point, which need not be finished."""
     env, agent, programs = saved.find(folder, point)
-    metrics = _read_tables(programs, "metrics.csv", metric, x)
+    metrics = _read_tables(programs, "metrics.csv", metric)
     if not metrics:
         raise InputError(f"{folder} has no curves to draw yet")
     values = metrics[metric]
-    env_steps, means = plotting.binned_returns(metrics[x][0], values)
+    env_steps, means = plotting.binned_returns(metrics["env_steps"][0], values)
     if not len(env_steps):
         raise InputError(f"{folder}: not every seed has ended an episode")
-    # Evaluations know the steps and the return alone.
+    # Evaluations know the return alone.
     evaluations: Mapping[str, np.ndarray] = {}
-    if (metric, x) == ("episode_return", "env_steps"):
+    if metric == "episode_return":
         evaluations = _read_tables(programs, "evaluations.csv", "mean")
     return Curves(
         env=env,
@@ -100,87 +85,26 @@ def read(
 
 
 def _read_tables(
-    programs: Sequence[Program], name: str, column: str, x: str = "env_steps"
+    programs: Sequence[Program], name: str, column: str
 ) -> dict[str, np.ndarray]:
-    """Return columns of tables for all members, up to the last row that all have."""
-    required = (
-        () if name == "metrics.csv" and column not in tables.COLUMNS else (column,)
-    )
+    """Return steps and a column for all members, up to the last row that all have."""
+    required = (column,) if column in (*tables.COLUMNS, "mean") else ()
     every = [own for each in programs for own in each.table(name, required)]
     if not all(every):
         return {}
     if column not in every[0]:
         raise InputError(unknown("metric", column, [*every[0]]))
     length = min(len(columns["env_steps"]) for columns in every)
-    found = {
+    return {
         x: np.stack([columns[x][:length] for columns in every])
         for x in ("env_steps", column)
     }
-    found["iteration"] = np.tile(np.arange(1, length + 1), (len(every), 1))
-    if x == "episodes":
-        counts = np.stack([columns[x][:length] for columns in every])
-        found[x] = np.cumsum(np.nan_to_num(counts), axis=1).mean(axis=0, keepdims=True)
-    return found
-
-
-def read_csv(path: pathlib.Path, label: str | None, columns: Sequence[str]) -> Curves:
-    """Return the curves of another library's CSV file, or of a folder of them."""
-    if len(columns) != 2:
-        raise InputError(
-            f"columns has {len(columns)} names: {path} needs two, of x and the return"
-        )
-    files = sorted(path.glob("*.csv")) if path.is_dir() else [path]
-    seeds = [_read_numbers(file, columns) for file in files]
-    # All seeds at the steps of the one with the fewest rows, as far as all reach.
-    steps = min((steps for steps, _ in seeds), key=len)
-    steps = steps[steps <= min(own[-1] for own, _ in seeds)]
-    values = np.array([np.interp(steps, own, returns) for own, returns in seeds])
-    env_steps, means = plotting.binned_returns(steps, values)
-    final = tables.final_returns(values)
-    return Curves("", label or path.stem, env_steps, means, final, None)
-
-
-def _read_numbers(path: pathlib.Path, columns: Sequence[str]) -> list[np.ndarray]:
-    """Return two columns of a CSV file, without rows that lack a number of either."""
-    plain = [name.removeprefix("sum:") for name in columns]
-    try:
-        # Stable-Baselines3's monitor begins with a comment.
-        lines = [x for x in path.read_text().splitlines() if not x.startswith("#")]
-    except (OSError, UnicodeDecodeError):
-        raise InputError(f"runs is {path}: it must be a run or a CSV file") from None
-    table = csv.DictReader(lines)
-    for name in plain:
-        if name not in (table.fieldnames or ()):
-            raise InputError(unknown("columns", name, [*(table.fieldnames or ())]))
-    try:
-        rows = [
-            [float(row[x]) for x in plain] for row in table if all(map(row.get, plain))
-        ]
-    except ValueError as error:
-        raise InputError(f"{path} is damaged: {error}") from None
-    if not rows:
-        raise InputError(f"{path} has no row with numbers in {' and '.join(plain)}")
-    both = np.array(rows).T
-    return [
-        np.cumsum(own) if name.startswith("sum:") else own
-        for name, own in zip(columns, both, strict=True)
-    ]
 
 
 def draw(
-    runs: Sequence[Curves],
-    path: pathlib.Path,
-    *,
-    metric: str = "episode_return",
-    x: str = "env_steps",
-    smooth: int = 1,
+    runs: Sequence[Curves], path: pathlib.Path, metric: str = "episode_return"
 ) -> None:
-    """Write the figure: interquartile means over seeds, with their 95% intervals.
-
-    Each environment has a row of three panels. The left one shows returns over
-    environment steps, with evaluations dashed; the middle one final returns, with a dot
-    for each seed; the right one the share of seeds above each final return.
-    """
+    """Draw each environment's returns, final returns and performance profiles."""
     from matplotlib.figure import Figure
 
     envs = list(dict.fromkeys(run.env for run in runs))
@@ -188,7 +112,7 @@ def draw(
     grid = figure.subplots(len(envs), 3, width_ratios=(3, 2, 2), squeeze=False)
     for row, env in zip(grid, envs, strict=True):
         own = [run for run in runs if run.env == env]
-        _draw_row(row, own, x=x, smooth=smooth)
+        _draw_row(row, own)
         words = metric.replace("_", " ")
         row[0].set_ylabel(words)
         for axes in row[1:]:
@@ -200,7 +124,7 @@ def draw(
     figure.savefig(path, dpi=150)
 
 
-def _draw_row(row: Any, runs: Sequence[Curves], *, x: str, smooth: int) -> None:
+def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
     """Draw the runs of one environment in its three panels."""
     curves, bars, profile = row
     every = np.concatenate([run.final for run in runs])
@@ -211,9 +135,7 @@ def _draw_row(row: Any, runs: Sequence[Curves], *, x: str, smooth: int) -> None:
     labels = [f" {label}" if label.startswith("_") else label for label in labels]
     margin = 0.05 * (np.ptp(every) or 1.0)
     levels = np.linspace(every.min() - margin, every.max() + margin, 200)
-    unit, words = 1.0, x
-    if x == "env_steps":
-        unit, words = plotting.unit_of_steps(max(run.env_steps[-1] for run in runs))
+    unit, words = plotting.unit_of_steps(max(run.env_steps[-1] for run in runs))
     curves.set_xlabel(words)
     for number, run in enumerate(runs):
         color = COLORS[number % len(COLORS)]
@@ -221,7 +143,7 @@ def _draw_row(row: Any, runs: Sequence[Curves], *, x: str, smooth: int) -> None:
         plotting.draw_returns(
             curves,
             run.env_steps,
-            plotting.smoothed(run.returns, smooth),
+            run.returns,
             unit=unit,
             evaluations=run.evaluations,
             color=color,
@@ -252,12 +174,6 @@ def _draw_row(row: Any, runs: Sequence[Curves], *, x: str, smooth: int) -> None:
     bars.locator_params(axis="x", nbins=5)
 
 
-def _is_csv(path: pathlib.Path) -> bool:
-    """Return whether a path is another library's CSV file, or a folder of them."""
-    has_tables = not folders.has_config(path) and any(path.glob("*.csv"))
-    return path.suffix == ".csv" or has_tables
-
-
 @reports_errors
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit status."""
@@ -270,35 +186,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"labels has {len(labels)} names: it must have one for each of the "
             f"{len(options.runs)} runs"
         )
-    if options.smooth < 1:
-        raise InputError(f"smooth is {options.smooth}: it must be 1 or more")
-    if options.x not in _X:
-        raise InputError(unknown("x", options.x, _X))
     output_file.check(options.out, (".png", ".pdf", ".svg"))
-    drawn = {"metric": options.metric, "x": options.x}
-    read_of: list[tuple[pathlib.Path, Curves]] = []
-    for folder, label in zip(options.runs, labels, strict=True):
-        if _is_csv(folder):
-            read_of.append((folder, read_csv(folder, label, options.columns)))
-            continue
-        best = results.best_of_agents(folder) if options.point is None else {}
-        points: list[tuple[str | None, int | None]] = [*best.items()]
-        for agent, point in points or [(None, options.point)]:
-            own = f"{label}, {agent}" if label and agent else label
-            read_of.append((folder, read(folder, own, point, **drawn)))
-    # A file does not say its environment: it is compared with the first run.
-    env = next((run.env for _, run in read_of if run.env), "")
-    told = [run.label for _, run in read_of]
     runs = [
-        run._replace(
-            env=run.env or env,
-            label=f"{run.label} ({folder})" if told.count(run.label) > 1 else run.label,
-        )
-        for folder, run in read_of
+        read(folder, label, options.point, metric=options.metric)
+        for folder, label in zip(options.runs, labels, strict=True)
+    ]
+    told = [run.label for run in runs]
+    runs = [
+        run._replace(label=f"{run.label} ({folder})")
+        if told.count(run.label) > 1
+        else run
+        for folder, run in zip(options.runs, runs, strict=True)
     ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
-        draw(runs, partial, smooth=options.smooth, **drawn)
+        draw(runs, partial, options.metric)
     print("run                             seeds  interquartile mean [95% interval]")
     for run in runs:
         estimate = statistics.estimate(run.final)

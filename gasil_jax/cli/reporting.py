@@ -1,11 +1,8 @@
 """Turn the errors of a command into one line and an exit status."""
 
 import contextlib
-import errno
 import functools
-import io
 import os
-import re
 import signal
 import sys
 from collections.abc import Callable
@@ -13,7 +10,7 @@ from typing import ParamSpec
 
 from gasil_envs.user_code import in_a_line
 from gasil_jax.errors import InputError
-from gasil_jax.host.interruption import Interrupted, allow_interrupts
+from gasil_jax.host.interruption import Interrupted
 
 P = ParamSpec("P")
 
@@ -22,29 +19,18 @@ class HelpShown(SystemExit):
     """Ends a command that has printed its help or its version."""
 
 
-def shortened(text: str) -> str:
-    """Return a text without the middle of words that are longer than most paths."""
-    return re.sub(r"(\S{40})\S{900,}(\S{20})", r"\1...\2", text)
-
-
 def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
     """Decorate a command's `main`: print its errors and return their exit status.
 
     The status is 1 if a folder or file can't be read or written, or if a program that
-    it started failed; 2 for bad input, which includes a file name that is too long; and
-    128 plus the signal's number if it was interrupted, or if nobody reads its output to
-    the end. Without an error it is what `main` returns. If the user's own code, such as
-    an environment or an agent, calls `sys.exit`, that counts as bad input.
+    it started failed; 2 for bad input, which includes that the user's own code calls
+    `sys.exit`; and 128 plus the signal's number if it was interrupted, or if nobody
+    reads its output to the end. Without an error it is what `main` returns.
     """
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
-        out = sys.stdout
-        if isinstance(out, io.TextIOWrapper) and out.errors == "strict":
-            # A name that the terminal can't show must not fail a finished command.
-            out.reconfigure(errors="backslashreplace")
         try:
-            allow_interrupts()
             return main(*args, **kwargs)
         except BrokenPipeError:
             # `head` reads a few lines only. Python would still try to write the rest.
@@ -52,10 +38,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
             return 128 + signal.SIGPIPE
         except (InputError, OSError) as error:
             # A name may hold a line break.
-            told = r"\n".join(f"error: {shortened(str(error))}".splitlines())
-            print(told, file=sys.stderr)
-            too_long = isinstance(error, OSError) and error.errno == errno.ENAMETOOLONG
-            return 2 if too_long or isinstance(error, InputError) else 1
+            print(*f"error: {error}".splitlines(), sep=r"\n", file=sys.stderr)
+            return 2 if isinstance(error, InputError) else 1
         except HelpShown:
             raise
         except SystemExit as exit_:

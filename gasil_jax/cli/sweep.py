@@ -1,12 +1,7 @@
 """Train a sweep: ``python -m gasil_jax.sweep --env hopper --grid alpha=0.02,0.1``.
 
-Points that differ only in traced numbers run in one compiled program, with seeds x
-points vmapped and sharded. Points that differ in a count (such as buffer size or
-discriminator updates) are grouped, and each group compiles once.
-
 A run that is there is never trained again. So --resume continues a sweep, and may add
-points and seeds to it. With --shard 3/8 an eighth of all points and seeds is trained in
-the same folder; the tables are written once no run is missing.
+points and seeds to it.
 """
 
 import argparse
@@ -14,7 +9,7 @@ from collections.abc import Sequence
 from typing import cast
 
 from gasil_jax.cli import options as options_
-from gasil_jax.cli import parsing, train
+from gasil_jax.cli import parsing, run
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
@@ -45,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         if options.out is None:
             raise InputError("shard needs --out and the folder of the whole sweep")
-    train.train(options, requested, program, shard=shard)
+    run.train(options, requested, program, shard=shard)
     return 0
 
 
@@ -76,5 +71,5 @@ def _launch(
     requested = requested.continued_from(options.out)
     with folders.lock(options.out, seconds=60.0):
         trained, env = requested.trained(options.out), training.make_env(requested)
-        results = train.write(options.out, requested, env, trained)
-    train.tell(options.out, results, env)
+        results = run.write(options.out, requested, env, trained)
+    run.tell(options.out, results, env)

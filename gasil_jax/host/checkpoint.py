@@ -14,14 +14,11 @@ training continues from an older one.
 
 import contextlib
 import hashlib
-import json
-import logging
 import math
 import os
 import pathlib
 import re
 import shutil
-import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any, NamedTuple, TypedDict
@@ -59,23 +56,11 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     """Yield Orbax's checkpointer, and another path to a folder that it understands.
 
     Orbax takes a path with brackets or stars for a pattern, so no character of the
-    other path means anything. What fails in Orbax's threads is raised once, and not
-    logged.
+    other path means anything.
     """
     # Commands that read no checkpoint, such as --help, start sooner without it.
     import orbax.checkpoint as ocp
 
-    logger, before = logging.getLogger("absl"), sys.unraisablehook
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    logging.getLogger("asyncio").addFilter(_is_news)
-
-    def report(unraisable: Any) -> None:
-        # TensorStore reports each array to Orbax's loop, which ends with the first.
-        if "Event loop is closed" not in str(unraisable.exc_value):
-            before(unraisable)
-
-    sys.unraisablehook = report
     try:
         with tempfile.TemporaryDirectory() as directory:
             link = pathlib.Path(directory, "checkpoints")
@@ -87,11 +72,6 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
         if codes := re.findall(r"os_error_code='(\d+)'", "".join(_chain(error))):
             raise OSError(int(codes[0]), os.strerror(int(codes[0]))) from None
         raise
-    else:
-        # After an error threads that are left still report.
-        sys.unraisablehook = before
-    finally:
-        logger.setLevel(level)
 
 
 def _chain(error: BaseException | None) -> list[str]:
@@ -99,11 +79,6 @@ def _chain(error: BaseException | None) -> list[str]:
     if error is None:
         return []
     return [*_chain(error.__cause__ or error.__context__), str(error)]
-
-
-def _is_news(record: logging.LogRecord) -> bool:
-    """Return false for the system's errors, of which Orbax raises the first itself."""
-    return "os_error_code" not in record.getMessage()
 
 
 def save(folder: pathlib.Path, state: Any) -> None:
@@ -197,11 +172,6 @@ class Checkpoint(NamedTuple):
     def restore(self, like: Any) -> Any:
         """Return the saved state; see the function `restore`."""
         return restore(self.folder / _STATE, like)
-
-    def digest(self) -> str:
-        """Return a hash of its files."""
-        files = json.dumps(_manifest(self.folder)["files"], sort_keys=True)
-        return hashlib.sha256(files.encode()).hexdigest()
 
 
 class WriteError(output_file.WriteError):
@@ -330,11 +300,7 @@ def _scores(folders: list[pathlib.Path]) -> dict[pathlib.Path, float]:
 
 
 def set_aside(root: pathlib.Path, newer_than: int) -> None:
-    """Rename the checkpoints after an iteration to NAME.damaged.
-
-    They are newer than the newest undamaged checkpoint. If they kept their names,
-    `prune` would keep them instead of undamaged ones.
-    """
+    """Rename damaged checkpoints, so that `prune` does not keep them for others."""
     for folder in _folders(root):
         if int(folder.name) > newer_than:
             renamed, number = folder.with_name(f"{folder.name}{_DAMAGED}"), 1

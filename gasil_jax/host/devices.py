@@ -13,23 +13,15 @@ import jaxlib
 
 from gasil_jax.host import environments
 from gasil_jax.host.environments import Settings
-from gasil_jax.host.output_file import note
 
 
 def use_devices(settings: Settings, requested: int | None, num_members: int) -> None:
     """Make JAX use the host's cores as devices; call it before JAX starts."""
     count = min(requested or environments.available_cores(), max(1, num_members))
     environments.prepare(settings, count)
-    try:
+    # If the program has used JAX before, the devices stay as they are.
+    with contextlib.suppress(RuntimeError):
         jax.config.update("jax_num_cpu_devices", count)
-    except RuntimeError:
-        # The program has used JAX before, so the devices stay as they are.
-        running = len(jax.devices("cpu"))
-        if requested is not None and running != count:
-            note(
-                f"devices is {requested}, which has no effect: JAX is already running "
-                f"with {running} CPU device{'s' if running > 1 else ''}"
-            )
     _keep_compiled_programs()
     # For all functions, not only those with `full_precision`.
     jax.config.update("jax_default_matmul_precision", "highest")

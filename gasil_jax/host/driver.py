@@ -37,7 +37,6 @@ from gasil_jax.train import TrainState
 # after each chunk.
 _SECONDS_PER_CHUNK = 5.0
 _SECONDS_BETWEEN_CHECKPOINTS = 600.0
-_AFTER_COMPILATION = "stopping after compilation; Ctrl-C again quits now"
 
 _Columns = Mapping[str, np.ndarray]
 
@@ -138,6 +137,7 @@ class _Training:
         done, env_steps = self.done, self.done * self.members.config.batch_steps
 
         def copy_states() -> TrainState:
+            # JAX may crash at arrays whose memory training has used since.
             if done != self.done:
                 raise RuntimeError(
                     f"the states of iteration {done} are gone: read FitProgress.states "
@@ -216,13 +216,7 @@ def drive(
     trackers: Sequence[Tracker] = (),
     callback: Callback | None = None,
 ) -> Outcome:
-    """Train to the end, from the newest undamaged checkpoint if the folder has one.
-
-    After each chunk a signal is answered with a checkpoint and `Interrupted`, and the
-    callback may end training. The labels, (members,) each, identify the members in the
-    tables; `progress` has counted `steps_before` environment steps already. The
-    trackers are closed at the end.
-    """
+    """Train to the end, from the newest undamaged checkpoint if the folder has one."""
     root = folder / "checkpoints"
     training, record = _restored(members, root, progress)
     rows: Mapping[str, Any] = record or {}
@@ -288,11 +282,7 @@ def drive(
 
     started = time.monotonic()
     if training.left:
-        what = "compiling training and first states"
-        with (
-            interruption.answering(_AFTER_COMPILATION),
-            progress.aside(what, at_once=True),
-        ):
+        with progress.aside("compiling training and first states", at_once=True):
             training.compile()
     compile_seconds = time.monotonic() - started
 

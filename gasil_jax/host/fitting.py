@@ -13,7 +13,7 @@ import numpy as np
 
 from gasil_jax import checks
 from gasil_jax.algorithms import Algorithm, check_numbers
-from gasil_jax.config import Range, validate_switch
+from gasil_jax.config import Range, validate, validate_switch
 from gasil_jax.errors import refusal
 from gasil_jax.host import (
     descriptions,
@@ -110,14 +110,12 @@ def fit(
     checks.check_environment(env)
     checks.check(env, algorithm)
     numbers = _numbers(seeds)
-    for name, value in (
-        ("checkpoint_every", checkpoint_every),
-        ("evaluate_every", evaluate_every),
-        ("evaluate_episodes", evaluate_episodes),
-    ):
-        default = value is None and name != "evaluate_episodes"
-        if value not in _COUNT and not default:
-            raise refusal(name, value, _COUNT)
+    recording = Recording(
+        checkpoint_every=checkpoint_every,
+        evaluate_every=evaluate_every,
+        evaluate_episodes=evaluate_episodes,
+    )
+    validate(recording)
     validate_switch("resume", resume)
     if not isinstance(folder, str | pathlib.PurePath | None):
         raise refusal("folder", folder, "a string or a pathlib.Path")
@@ -133,12 +131,8 @@ def fit(
         raise refusal("points", points, allowed)
     for point in every:
         check_numbers(algorithm, point)
-    recording = Recording(
-        checkpoint_every=checkpoint_every,
-        keep_checkpoints=0 if folder is None else 2,
-        evaluate_every=evaluate_every,
-        evaluate_episodes=evaluate_episodes,
-    )
+    if folder is None:
+        recording = dataclasses.replace(recording, keep_checkpoints=0)
     requested = _describe(env, _plain(algorithm), numbers, recording)
     every = completed(every, requested.algorithm)
     requested = dataclasses.replace(requested, points=every)
@@ -231,15 +225,11 @@ def _describe(
         why = why or "a schedule that is a function"
     except ValueError as error:
         why = why or str(error)
-    if made_with is None:
-        name = type(getattr(env, "unwrapped", env)).__name__
-        return Sweep(name, algorithm, seeds, recording=recording, only_python=why)
-    name, settings = made_with
-    return Sweep(
-        name,
-        algorithm,
-        seeds,
-        settings=settings,
-        recording=recording,
-        only_python=why,
-    )
+    kind = type(getattr(env, "unwrapped", env)).__name__
+    name, settings = made_with or (kind, environments.Settings())
+    own: dict[str, Any] = {
+        "settings": settings,
+        "recording": recording,
+        "only_python": why,
+    }
+    return Sweep(name, algorithm, seeds, **own)

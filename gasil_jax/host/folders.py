@@ -13,10 +13,9 @@ from collections.abc import Iterator
 
 from gasil_jax.errors import InputError
 from gasil_jax.host import output_file
-from gasil_jax.host.output_file import note, unwritable
+from gasil_jax.host.output_file import note, refused
 
 _LOCK = ".lock"
-_PROBE = ".writable-"
 CONFIG = "config.json"
 #: Errors of locking where there are no locks.
 _NO_LOCKS = (*output_file.MISSING_CALL, errno.ENOLCK)
@@ -24,39 +23,31 @@ _NO_LOCKS = (*output_file.MISSING_CALL, errno.ENOLCK)
 
 def create(folder: pathlib.Path, *, option: str = "out") -> pathlib.Path:
     """Create a folder if it is missing, and return it."""
-    try:
+    with refused(folder, option):
         folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(unwritable(folder, error, option)) from None
+    check_writable(folder, option=option)
     return folder
 
 
 def create_new(name: str) -> pathlib.Path:
     """Create a folder under runs/, with a number after its name if that is taken."""
-    runs, number = create(pathlib.Path("runs")), 1
+    folder, number = create(pathlib.Path("runs")) / name, 1
     while True:
-        folder = runs / (name if number == 1 else f"{name}-{number}")
-        try:
+        with refused(folder), contextlib.suppress(FileExistsError):
             folder.mkdir()
             return folder
-        except FileExistsError:
-            number += 1
-        except OSError as error:
-            raise InputError(unwritable(folder, error)) from None
+        number += 1
+        folder = folder.with_name(f"{name}-{number}")
 
 
-def check_writable(folder: pathlib.Path) -> None:
+def check_writable(folder: pathlib.Path, *, option: str = "out") -> None:
     """Raise `InputError` if a folder, or where it would be made, is read-only."""
     existing = folder
-    while not existing.exists():
-        existing = existing.parent
-    try:
-        with tempfile.TemporaryDirectory(prefix=_PROBE, dir=existing):
+    with refused(folder, option):
+        while not existing.exists():
+            existing = existing.parent
+        with tempfile.TemporaryDirectory(prefix=".writable-", dir=existing):
             pass
-    except OSError as error:
-        raise InputError(unwritable(folder, error)) from None
 
 
 @functools.cache
@@ -107,18 +98,9 @@ def lock(
 def refuse_used(folder: pathlib.Path, *, option: str = "out") -> None:
     """Raise `InputError` unless the folder is empty or missing.
 
-    What killed processes may leave does not count: the lock, half written files and the
-    folder by which `create` tests whether it can write.
+    Hidden files do not count: the lock, and what killed processes may leave.
     """
-    if not folder.exists():
-        return
-    used = any(
-        path.name != _LOCK
-        and not path.name.startswith(_PROBE)
-        and not output_file.is_temporary(path)
-        for path in folder.iterdir()
-    )
-    if used:
+    if folder.exists() and not all(x.name.startswith(".") for x in folder.iterdir()):
         resume = "--resume" if option == "out" else "resume=True"
         more = f", or continue what is in it with {resume}"
         raise InputError(

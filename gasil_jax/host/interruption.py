@@ -1,39 +1,14 @@
 """Record SIGINT and SIGTERM, so that training can save before it stops."""
 
 import contextlib
-import os
 import signal
 import sys
 from collections.abc import Iterator
 from types import FrameType
 from typing import Any
 
-
-def runs_as_program(package: str) -> bool:
-    """Whether Python is about to run a module of the package as a program.
-
-    It imports the package before it. While it looks for the module that -m names, the
-    first argument is "-m".
-    """
-    ours = any(x.removeprefix("-m").split(".")[0] == package for x in sys.orig_argv)
-    return ours and sys.argv[:1] == ["-m"]
-
-
-def quit_during_imports() -> None:
-    """Let Ctrl-C end this process in a line until `allow_interrupts` is called."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _quit)
-
-
-def _quit(number: int, frame: FrameType | None) -> None:
-    os.write(2, b"interrupted\n")
-    os._exit(128 + number)
-
-
-def allow_interrupts() -> None:
-    """Let Ctrl-C raise `KeyboardInterrupt` again, after `quit_during_imports`."""
-    if signal.getsignal(signal.SIGINT) is _quit:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+#: What a signal is answered with at once: a compilation or a chunk ends before.
+ANSWER = "stopping soon; Ctrl-C again quits now"
 
 
 class Interrupted(Exception):
@@ -68,7 +43,6 @@ class Interruption:
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None
         self._before: dict[int, Any] = {}
-        self._answer: str | None = None
 
     def __enter__(self) -> "Interruption":
         # Python allows signal handlers only in the main thread.
@@ -80,20 +54,10 @@ class Interruption:
     def __exit__(self, *exception: object) -> None:
         self._restore()
 
-    @contextlib.contextmanager
-    def answering(self, text: str) -> Iterator[None]:
-        """Print a line when a signal is received in the `with` block."""
-        self._answer = text
-        try:
-            yield
-        finally:
-            self._answer = None
-
     def _record(self, number: int, frame: FrameType | None) -> None:
         self.signal = signal.Signals(number)
         self._restore()
-        if self._answer is not None:
-            print(self._answer, file=sys.stderr, flush=True)
+        print(ANSWER, file=sys.stderr, flush=True)
 
     def _restore(self) -> None:
         for number, handler in self._before.items():

@@ -7,22 +7,14 @@ import math
 import pathlib
 import types
 import typing
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, get_args, get_origin, get_type_hints
 
 import jax
 import numpy as np
 
-from gasil_jax.errors import InputError, NotImportable
+from gasil_jax.errors import InputError, NotImportable, shown
 from gasil_jax.host import output_file
-
-_DESCRIPTIONS = {
-    str: "a string",
-    int: "a whole number, 0 or more",
-    float: "a finite number",
-    bool: "true or false",
-    types.NoneType: "null",
-}
 
 
 def write(path: pathlib.Path, content: Mapping[str, Any]) -> None:
@@ -74,15 +66,10 @@ def as_type(kind: Any, value: Any, name: str) -> Any:
         return _with_tuples(value)
     if origin in (typing.Union, types.UnionType):
         for option in arguments:
-            try:
+            with contextlib.suppress(InputError):
                 return as_type(option, value, name)
-            except InputError:
-                if isinstance(value, list | dict):
-                    raise
     elif origin is dict and isinstance(value, dict):
-        return {
-            key: as_type(arguments[1], x, _join(name, key)) for key, x in value.items()
-        }
+        return {key: as_type(arguments[1], x, key) for key, x in value.items()}
     elif origin is tuple and isinstance(value, list | tuple):
         kinds = arguments
         if len(arguments) == 2 and arguments[1] is ...:
@@ -90,23 +77,19 @@ def as_type(kind: Any, value: Any, name: str) -> Any:
         if len(value) == len(kinds):
             return tuple(as_type(one, x, name) for one, x in zip(kinds, value))
     elif isinstance(value, dict) and dataclasses.is_dataclass(kind):
-        hints = get_type_hints(kind)
-        for key in value:
-            if key not in hints:
-                raise InputError(f"{_join(name, key)} is unknown")
-        made: Any = kind
-        return made(**{x: as_type(hints[x], y, x) for x, y in value.items()})
+        return kind(**_fields(kind, value))  # type: ignore[operator]
     elif isinstance(value, dict) and typing.is_typeddict(kind):
-        if missing := sorted(kind.__required_keys__ - set(value)):
-            raise InputError(f"{_join(name, missing[0])} is missing")
-        hints = get_type_hints(kind)
-        return {
-            key: as_type(hints.get(key, Any), x, _join(name, key))
-            for key, x in value.items()
-        }
-    elif kind in _DESCRIPTIONS and _is_plain(kind, value):
+        for missing in sorted(kind.__required_keys__ - set(value)):
+            raise InputError(f"{missing} is missing")
+        return _fields(kind, value)
+    elif _is_plain(kind, value):
         return value
-    raise InputError(f"{name or 'it'} is {value!r}: it must be {_describe(kind)}")
+    raise InputError(f"{name or 'its content'} is {shown(value)}")
+
+
+def _fields(kind: Any, value: Mapping[str, Any]) -> dict[str, Any]:
+    hints = get_type_hints(kind)
+    return {key: as_type(hints.get(key, Any), x, key) for key, x in value.items()}
 
 
 def _is_plain(kind: Any, value: Any) -> bool:
@@ -117,21 +100,6 @@ def _is_plain(kind: Any, value: Any) -> bool:
     if kind is int:
         return type(value) is int and value >= 0
     return type(value) is kind
-
-
-def _describe(kind: Any) -> str:
-    arguments = get_args(kind)
-    if get_origin(kind) in (typing.Union, types.UnionType):
-        return " or ".join(
-            _describe(one) for one in arguments if get_origin(one) is not Callable
-        )
-    if get_origin(kind) is tuple:
-        return "a list"
-    return _DESCRIPTIONS.get(kind, "an object")
-
-
-def _join(name: str, key: str) -> str:
-    return f"{name}.{key}" if name else key
 
 
 def _with_tuples(value: Any) -> Any:

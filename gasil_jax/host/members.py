@@ -7,10 +7,9 @@ alone, not from the members beside it or from the device it runs on.
 import dataclasses
 import functools
 import math
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from concurrent import futures
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,8 +23,6 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.config import Config, Range
 from gasil_jax.errors import refusal
 from gasil_jax.host import resources
-
-T = TypeVar("T")
 
 
 def member(states: Any, index: int) -> Any:
@@ -47,27 +44,10 @@ def member(states: Any, index: int) -> Any:
     return jax.tree.map(lambda x: x[index], states)
 
 
-def _in_thread(function: Callable[[], T]) -> futures.Future[T]:
-    """Call a function in a thread, so that this one can answer to signals."""
-    future: futures.Future[T] = futures.Future()
-
-    def call() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:
-            future.set_exception(error)
-
-    threading.Thread(target=call).start()
-    return future
-
-
 def advance_members(
     env: Any, algorithm: Algorithm, states: Any, num_iterations: jax.Array, data: Any
 ) -> tuple[Any, train.Metrics]:
-    """Train members side by side for at most `chunk_size(config)` iterations.
-
-    Metrics are (members, chunk), NaN after the first `num_iterations` columns.
-    """
+    """Train members for some iterations; metrics are (members, chunk), then NaN."""
     # A jitted function is traced once for both uses, which saves seconds.
     step = jax.jit(
         jax.vmap(lambda state: train.train_step(env, algorithm, state, data=data))
@@ -97,10 +77,7 @@ def chunk_size(config: Config) -> int:
 
 @dataclasses.dataclass(frozen=True)
 class Members:
-    """The members that train in one program.
-
-    Their arrays are padded to a multiple of the number of devices: (padded, ...).
-    """
+    """The members that train in one program; their arrays are padded: (padded, ...)."""
 
     env: Any  # one environment
     algorithm: Algorithm  # the algorithm that the members share
@@ -199,14 +176,16 @@ class Members:
         arguments = shapes, np.int32(0), self.data
         traced = self.advance.trace(*arguments)
         resources.check_arrays(traced.jaxpr.jaxpr, self.algorithm, self.devices)
-        compiled = _in_thread(lambda: traced.lower().compile())
-        # The first states have a program of their own, which takes seconds too.
-        first = _in_thread(
-            lambda: jax.block_until_ready(
-                self.init() if states is None else self.to_devices(states)
-            )
-        )
-        return first.result(), compiled.result()
+
+        def first() -> Any:
+            moved = self.init() if states is None else self.to_devices(states)
+            return jax.block_until_ready(moved)
+
+        # In threads, so that this one can answer to signals. The first states have a
+        # program of their own, which takes seconds too.
+        pool = futures.ThreadPoolExecutor()
+        compiled = pool.submit(lambda: traced.lower().compile())
+        return pool.submit(first).result(), compiled.result()
 
     def vmap(self, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function of one member for all, (padded, ...), sharded likewise."""
@@ -249,10 +228,7 @@ class Members:
         )
 
     def trim(self, states: Any) -> Any:
-        """Return the members' arrays without the padding, (members, ...).
-
-        If there is padding, they are NumPy arrays and random keys.
-        """
+        """Return the members' arrays without the padding, (members, ...)."""
         if not self._padding:
             return states
 

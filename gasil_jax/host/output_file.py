@@ -4,7 +4,6 @@ import contextlib
 import errno
 import os
 import pathlib
-import re
 import sys
 import uuid
 from collections.abc import Iterator, Sequence
@@ -26,9 +25,14 @@ def note(text: str) -> None:
     print(f"note: {text}", file=sys.stderr)
 
 
-def unwritable(path: pathlib.Path, error: OSError, option: str = "out") -> str:
-    """Return the error message for an option's folder or file that can't be written."""
-    return f"{option} is {path}, which can't be written: {_reason(error)}"
+@contextlib.contextmanager
+def refused(path: pathlib.Path, option: str = "out") -> Iterator[None]:
+    """Turn an `OSError` from the `with` block into the refusal of an option's path."""
+    try:
+        yield
+    except OSError as error:
+        why = f"which can't be written: {_reason(error)}"
+        raise InputError(f"{option} is {path}, {why}") from None
 
 
 def unwritten(path: pathlib.Path, error: Exception) -> str:
@@ -72,13 +76,11 @@ def check(path: pathlib.Path, endings: Sequence[str]) -> None:
 
 def make_parent(path: pathlib.Path) -> None:
     """Create the folder of a file, and check that a file can be written in it."""
-    try:
+    with refused(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         probe = _partial(path)
         probe.touch()
         probe.unlink()
-    except OSError as error:
-        raise InputError(unwritable(path, error)) from None
 
 
 def _partial(path: pathlib.Path) -> pathlib.Path:
@@ -86,18 +88,9 @@ def _partial(path: pathlib.Path) -> pathlib.Path:
     return path.with_name(f".{path.stem}.{uuid.uuid4().hex}{path.suffix}")
 
 
-def is_temporary(path: pathlib.Path) -> bool:
-    """Return whether it is a temporary file of `atomic`, by its name."""
-    return re.fullmatch(r"\..+\.[0-9a-f]{32}(\.\w+)?", path.name) is not None
-
-
 @contextlib.contextmanager
 def atomic(path: pathlib.Path) -> Iterator[pathlib.Path]:
-    """Yield a temporary path beside the file, which is renamed to it at the end.
-
-    A reader never sees a half written file, and several processes may write the same
-    file. If the block raises an error, the temporary file is deleted.
-    """
+    """Yield a temporary path beside the file, which is renamed to it at the end."""
     partial = _partial(path)
     try:
         with errors_named(path):

@@ -47,13 +47,6 @@ def binned_returns(
     return steps, np.stack(means, axis=1)
 
 
-def smoothed(returns: np.ndarray, window: int) -> np.ndarray:
-    """Return the means over each point and those before it, `window` in all."""
-    sums = np.cumsum(returns, axis=-1)
-    sums[..., window:] -= sums[..., :-window].copy()
-    return sums / np.minimum(np.arange(1, returns.shape[-1] + 1), window)
-
-
 def unit_of_steps(most: float) -> tuple[float, str]:
     """Return the unit in which steps up to `most` are drawn, and its name."""
     if most >= 500_000:
@@ -118,10 +111,7 @@ def learning_curve(
     title: str,
     evaluations: Mapping[str, np.ndarray] | None = None,
 ) -> None:
-    """Save the returns, (seeds, iterations), as a PNG: all seeds, mean and interval.
-
-    Evaluations are as in `draw_returns`.
-    """
+    """Save the returns, (seeds, iterations), of all seeds, with mean and interval."""
     from matplotlib.figure import Figure
 
     steps, returns = binned_returns(env_steps, episode_return)
@@ -260,23 +250,17 @@ def _draw_marginal(
     axes: Any, values: Sequence[Any], returns: np.ndarray, *, best: int | None
 ) -> None:
     """Draw the points' returns over one hyperparameter, and the mean of each value."""
-    if not isinstance(values[0], str):
-        places, style = np.array(values, float), "-D"
-        positive = places[places > 0.0]
-        # In floats 3e-4 / 3e-5 is less than 10.
-        if positive.size and positive.max() > 9.99 * positive.min():
-            # Values that are not positive lie on the linear part about 0.
-            linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
-            axes.set_xscale("symlog" if linear else "log", **linear)
-        if len(tried := np.unique(places)) <= _MOST_TICKS:
-            _mark_tried(axes, tried)
-    else:
-        names = list(dict.fromkeys(values))
-        places, style = np.array([names.index(x) for x in values]), "D"
-        axes.set_xticks(range(len(names)), [str(name) for name in names])
-    centres = np.unique(places)
-    means = [returns[places == centre].mean() for centre in centres]
-    axes.plot(centres, means, style, color=COLORS[0], markersize=6, label="mean")
+    places = np.array(values, float)
+    positive = places[places > 0.0]
+    # In floats 3e-4 / 3e-5 is less than 10.
+    if positive.size and positive.max() > 9.99 * positive.min():
+        # Values that are not positive lie on the linear part about 0.
+        linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
+        axes.set_xscale("symlog" if linear else "log", **linear)
+    if len(tried := np.unique(places)) <= _MOST_TICKS:
+        _mark_tried(axes, tried)
+    means = [returns[places == value].mean() for value in tried]
+    axes.plot(tried, means, "-D", color=COLORS[0], markersize=6, label="mean")
     axes.plot(places, returns, "o", color="0.3", markersize=3, label="point")
     axes.margins(x=0.1)
     if best is not None:

@@ -1,12 +1,7 @@
-"""Read or draw the points of a sweep.
-
-A point holds changed settings, by name; of a sweep over agents its "agent", too.
-"""
+"""Make or draw the points of a sweep, each of changed settings by name."""
 
 import itertools
-import json
 import math
-import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -16,7 +11,7 @@ from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.algorithms import check as check_algorithm
 from gasil_jax.config import names, ranges
-from gasil_jax.errors import InputError, did_you_mean, refusal, unknown
+from gasil_jax.errors import InputError, did_you_mean, refusal
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -54,54 +49,29 @@ def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
 
 def in_words(point: Point) -> str:
     """Return the values of a point as text."""
-    return ", ".join(
-        str(value) if name == "agent" else f"{name}={value:g}"
-        for name, value in point.items()
-    )
+    return ", ".join(f"{name}={value:g}" for name, value in point.items())
 
 
-def algorithm_of(
-    point: Point, algorithms: Sequence[Algorithm]
-) -> tuple[Algorithm, dict[str, Any]]:
-    """Return a point's algorithm, by default the first, and the values it changes."""
-    values = dict(point)
-    agent = values.pop("agent", algorithms[0].agent.name)
-    for algorithm in algorithms:
-        if algorithm.agent.name == agent:
-            return algorithm, values
-    raise InputError(unknown("agent", agent, [x.agent.name for x in algorithms]))
-
-
-def completed(every: Iterable[Point], *algorithms: Algorithm) -> tuple[Point, ...]:
-    """Return points that all have the same names, without repetitions.
-
-    A point that lacks a name has its algorithm's own value.
-    """
+def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
+    """Return points that all have the same names, without repetitions."""
     listed = list(every)
     varied = list(dict.fromkeys(name for point in listed for name in point))
-    whole = []
-    for point in listed:
-        algorithm, _ = algorithm_of(point, algorithms)
-        values = {"agent": algorithm.agent.name, **algorithm.settings, **point}
-        kinds = {"agent": str, **_kinds(algorithm)}
-        whole.append({x: kinds.get(x, float)(values[x]) for x in varied})
+    kinds, own = _kinds(algorithm), algorithm.settings
+    whole = [{x: kinds[x](point.get(x, own[x])) for x in varied} for point in listed]
     return tuple(x for i, x in enumerate(whole) if x not in whole[:i])
 
 
-def _grid(
-    grid: Sequence[str], algorithms: Sequence[Algorithm]
-) -> dict[str, tuple[Any, ...]]:
+def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
     """Return the values by name from entries NAME=VALUE,VALUE,..."""
     values: dict[str, tuple[Any, ...]] = {}
-    kinds = _kinds(algorithms[0])
+    kinds = _kinds(algorithm)
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
-        for algorithm in algorithms:
-            if name not in _kinds(algorithm):
-                raise InputError(f"grid: {_why_not(name, algorithm)}")
+        if name not in kinds:
+            raise InputError(f"grid: {_why_not(name, algorithm)}")
         number = whole_number if kinds[name] is int else float
         try:
             values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
@@ -118,27 +88,11 @@ def _grid(
     return values
 
 
-def _read(path: pathlib.Path, algorithms: Sequence[Algorithm]) -> list[Point]:
-    """Return the points that a JSON file lists."""
-    source = f"points_file is {path}"
-    try:
-        every = json.loads(path.read_text())
-    except (OSError, ValueError, RecursionError) as error:
-        raise InputError(f"{source}, which can't be read: {error}") from None
-    if not isinstance(every, list) or not every:
-        raise InputError(f"{source}: it must hold a list of points, one or more")
-    if not all(isinstance(point, dict) for point in every):
-        raise InputError(f"{source}: each point must be an object, NAME: VALUE")
-    check(every, *algorithms, source=f"{source}: ")
-    return every
-
-
-def check(every: Iterable[Point], *algorithms: Algorithm, source: str = "") -> None:
+def check(every: Iterable[Point], algorithm: Algorithm, *, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed."""
+    allowed, unused = _kinds(algorithm), without_effect(algorithm)
     try:
-        for point in every:
-            algorithm, values = algorithm_of(point, algorithms)
-            allowed, unused = _kinds(algorithm), without_effect(algorithm)
+        for values in every:
             for name, value in values.items():
                 if name not in allowed:
                     raise InputError(_why_not(name, algorithm))
@@ -162,8 +116,6 @@ def without_effect(algorithm: Algorithm) -> dict[str, str]:
 
 def _why_not(name: str, algorithm: Algorithm) -> str:
     """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
-    if name == "agent":
-        return "'agent' can't vary here: name several agents as --agent A,B"
     allowed = tuple(_kinds(algorithm))
     of_models = {x for model in REWARD_MODELS for x in names(model)}
     if name not in algorithm.settings and (name in of_models or agents_with(name)):
@@ -174,21 +126,16 @@ def _why_not(name: str, algorithm: Algorithm) -> str:
 def make_points(
     grid: Sequence[str],
     random: int | None,
-    points_file: pathlib.Path | None,
     *,
     seed: int,
-    algorithms: Sequence[Algorithm],
+    algorithm: Algorithm,
 ) -> list[Point]:
-    """Return the points of a sweep, of all its agents."""
-    if points_file is not None:
-        if grid or random is not None:
-            raise InputError("points_file can't be combined with grid or random")
-        return _read(points_file, algorithms)
-    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithms)
+    """Return the points of a sweep."""
+    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
     if random is None:
         every = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in every]
-    known = set.intersection(*({*_kinds(algorithm)} for algorithm in algorithms))
+    known = _kinds(algorithm)
     values = values or {name: x for name, x in PAPER_RANGES.items() if name in known}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)

@@ -136,10 +136,7 @@ class Program:
         return training is not None and training["iterations"] >= needed
 
     def tables(self) -> list[tuple[Columns, Columns]]:
-        """Return the metrics and the scores of each run, (rows,); {} without scores.
-
-        Training must have ended.
-        """
+        """Return the metrics and the scores of each trained run; {} without scores."""
         training = self.training
         assert training is not None
         metrics = self.table("metrics.csv", tables.SUMMARIZED)
@@ -224,10 +221,7 @@ def read(parent: pathlib.Path, requested: Collection[Run]) -> list[Program]:
 
 
 def labelled(parent: pathlib.Path, point: int) -> list[Program]:
-    """Return the programs that say that they hold a point, without its runs.
-
-    Only their tables can be read.
-    """
+    """Return the programs of a point without its runs: their tables can be read."""
     every = []
     for path in sorted(parent.glob(f"[!.]*/{_PROGRAM}")):
         labels = json_files.read(path, _Listed)["labels"]
@@ -250,12 +244,9 @@ def _note_left(path: pathlib.Path) -> None:
 def unfinished(
     requested: Collection[Run], stored: Sequence[Program]
 ) -> tuple[list[Program], list[Run]]:
-    """Return the programs to continue, and the requested runs that no program holds.
-
-    A program that is continued trains all of its runs, so one with members that nobody
-    asked for is not.
-    """
+    """Return the programs to continue, and the requested runs that no program holds."""
     finished = [x for x in stored if x.is_finished]
+    # A program that is continued trains all of its runs, also those of others.
     begun = [x for x in stored if x not in finished and not x.others]
     for each in stored:
         if each not in (*finished, *begun):

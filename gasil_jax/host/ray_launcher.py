@@ -33,11 +33,7 @@ def _run_module(program: str, arguments: Sequence[str]) -> int:
 def run_on_ray(
     program: str, jobs: Mapping[str, Sequence[str]], devices: int | None
 ) -> None:
-    """Run jobs as tasks of a Ray cluster, with a GPU each if it has GPUs, else on CPUs.
-
-    The cluster is RAY_ADDRESS's, else a running one, else a new one. If a task's worker
-    or node dies, the task is run again elsewhere.
-    """
+    """Run jobs on a cluster, with a GPU each if it has any; their nodes may die."""
     try:
         import ray
     except ImportError:
@@ -49,11 +45,9 @@ def run_on_ray(
         failed = _failures(ray, program, jobs, devices)
     if failed:
         told = ", ".join(f"{name} ({why})" for name, why in failed.items())
-        if list(failed.values()) == [f"status {_BAD_INPUT}"] * len(jobs):
-            raise InputError(f"{told}: bad input, see above")
         raise ChildProcessError(
-            f"{told} failed; the others are done. Continue with the same command and "
-            "--resume"
+            f"{told} failed, see above; the others are done. Continue with the same "
+            "command and --resume"
         )
 
 
@@ -62,22 +56,15 @@ def _failures(
 ) -> dict[str, str]:
     """Run jobs on a cluster; return why some have failed, by the job's name."""
     on_gpu = ray.cluster_resources().get("GPU", 0) >= 1
-    cpus = 1 if on_gpu else devices or 1
     # By default a job would use every core of its node.
     more = [] if on_gpu or devices else ["--devices", "1"]
-    nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
-    if not any(node.get("CPU", 0) >= cpus for node in nodes):
-        raise InputError(
-            f"launcher is 'ray': no node of the cluster has {cpus} CPUs, which each "
-            "job reserves"
-        )
     # JAX sets up its devices once per process, so each job needs its own. The process
     # ends with the job, so that the folder is free when the job runs again.
     task = ray.remote(
         max_calls=1,
         max_retries=RETRIES,
         retry_exceptions=[_Unfinished],
-        num_cpus=cpus,
+        num_cpus=1 if on_gpu else devices or 1,
         num_gpus=int(on_gpu),
     )(_run_module)
     names = {

@@ -4,7 +4,7 @@ import contextlib
 import math
 import pathlib
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 from jax.extend import core
@@ -19,20 +19,9 @@ from gasil_jax.host.sweep import Recording
 # Memory of a program besides its states, in batches. XLA reports 7 to 11 for eight
 # programs with different agents and shapes (tests/host/test_resources.py).
 _BATCHES_PER_PROGRAM = 8
-# Memory of a gradient step, or of a network's pass over a batch, in outputs of its
-# layers. XLA reports 1.9 to 3.1.
-_OUTPUTS_PER_STEP = 2.5
 # Memory of an evaluated episode, in states of its environment. XLA reports 7 (point
 # mass) and 25 (hopper).
 _STATES_PER_EPISODE = 7
-
-
-class Need(NamedTuple):
-    """The bytes that one run needs."""
-
-    memory: int  # memory during training
-    largest_part: str  # what most of the memory is for, in words
-    shared: int = 0  # memory of what all runs on a device share, the agent's data
 
 
 def check(
@@ -43,16 +32,12 @@ def check(
 ) -> None:
     """Raise `InputError`, with the sizes, if programs do not fit the memory."""
     for each in programs:
-        count = len(each.runs)
-        check_memory(need(env, each.algorithm), each.algorithm, count, devices)
+        count, algorithm = len(each.runs), each.algorithm
+        check_memory(need(env, algorithm), algorithm, count, devices)
         if recording.evaluate_every is not None:
-            check_episodes(
-                env,
-                recording.evaluate_episodes,
-                count,
-                devices,
-                option="evaluate_episodes",
-            )
+            episodes = recording.evaluate_episodes
+            option = "evaluate_episodes"
+            check_episodes(env, episodes, count, devices, option=option)
 
 
 def _size(tree: Any) -> int:
@@ -64,66 +49,18 @@ def _size(tree: Any) -> int:
     return sum(map(bytes_of, jax.tree.leaves(tree)))
 
 
-def need(env: Any, algorithm: Algorithm) -> Need:
-    """Estimate the bytes that one run needs; memory is within a factor of two."""
+def need(env: Any, algorithm: Algorithm) -> int:
+    """Estimate the bytes of memory that one run needs, within a factor of two."""
     state = jax.eval_shape(lambda: train.init(env, algorithm, jax.random.key(0)))
-    config, settings = algorithm.config, algorithm.settings
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + wrappers.action_size(env) + 12
-    batches = _BATCHES_PER_PROGRAM * 4 * config.batch_steps * numbers
-    steps = _gradient_steps(env, algorithm)
-    # What is learned may be large, and is copied if it is not donated. Gradient steps
-    # come after the batch's other uses, and one after the other.
-    agent, networks = _size(state.agent), _size(state.actor_critic)
-    memory = _size(state) + agent + networks + max(batches, *steps.values())
-    data = _size(jax.eval_shape(algorithm.agent.data))
-    buffers = "".join(
-        f", with {name} {settings[name]}"
-        for name in ("buffer_steps", "sil_buffer_steps")
-        if name in settings
-    )
-    episodes = (state.environments, state.history, state.rewards)
-    parts = {
-        f"batches, with batch_steps {config.batch_steps}": batches,
-        f"running episodes, with num_envs {config.num_envs}": _size(episodes),
-        f"the state of agent {algorithm.agent.name!r}{buffers}": 2 * agent,
-        f"the data of agent {algorithm.agent.name!r}": data,
-        "networks": 2 * networks,
-        **steps,
-    }
-    largest = max(parts, key=lambda part: parts[part])
-    return Need(memory, largest, data)
-
-
-def _gradient_steps(env: Any, algorithm: Algorithm) -> dict[str, int]:
-    """Return the bytes of each kind of gradient step, by the sizes in words.
-
-    These are the drawn steps and the outputs of a network's layers, also in a pass over
-    the whole batch.
-    """
-    settings, steps = algorithm.settings, {}
-    inputs = env.observation_size + wrappers.action_size(env)
-    for name, minibatch_size in settings.items():
-        # An agent of the user's may have one that is None.
-        if name.endswith("minibatch_size") and minibatch_size:
-            widths = name.replace("minibatch_size", "hidden_sizes")
-            widths = widths if widths in settings else "hidden_sizes"
-            sizes = {name: minibatch_size, "batch_steps": settings["batch_steps"]}
-            largest = max(sizes, key=lambda size: sizes[size])
-            # A model of delayed rewards draws whole windows.
-            window = settings.get(name.replace("minibatch_size", "window_steps"), 1)
-            rows = max(sizes[largest], minibatch_size * window)
-            outputs = _OUTPUTS_PER_STEP * 4 * rows * (inputs + sum(settings[widths]))
-            words = f"{largest} {rows} and {widths} {settings[widths]}"
-            steps[f"outputs of layers, with {words}"] = int(outputs)
-    return steps
+    batches = _BATCHES_PER_PROGRAM * 4 * algorithm.config.batch_steps * numbers
+    # What is learned may be large, and is copied if it is not donated.
+    return _size(state) + _size(state.agent) + _size(state.actor_critic) + batches
 
 
 def available(devices: Sequence[jax.Device]) -> int | None:
-    """Return the free bytes of the devices together; None if unknown.
-
-    All devices get equal shares, so the one with the least free memory counts.
-    """
+    """Return the free bytes of the devices, in equal shares; None if unknown."""
     if devices[0].platform != "cpu":
         every = [device.memory_stats() or {} for device in devices]
         if any("bytes_limit" not in stats for stats in every):
@@ -142,11 +79,7 @@ def _free_in_control_groups(
     root: pathlib.Path = pathlib.Path("/sys/fs/cgroup"),
     own: pathlib.Path = pathlib.Path("/proc/self/cgroup"),
 ) -> list[int]:
-    """Return the bytes left below each limit of this process's control group.
-
-    A group's limit also holds for the groups in it. The kernel's cache of files counts
-    as free.
-    """
+    """Return what is left below each limit of this process's control groups."""
     free: list[int] = []
     # Only Linux has control groups, and a group may have no limit.
     with contextlib.suppress(OSError, LookupError):
@@ -169,27 +102,20 @@ def _padded(count: int, devices: Sequence[jax.Device]) -> int:
 
 
 def check_memory(
-    one: Need, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
+    one: int, algorithm: Algorithm, num_members: int, devices: Sequence[jax.Device]
 ) -> None:
-    """Raise `InputError` if members, trained at once, do not fit into memory."""
-    used = devices[:num_members]
-    required = _padded(num_members, used) * one.memory + len(used) * one.shared
-    if (free := available(used)) is None or required <= free:
-        return
-    # Each device trains the same number of members.
-    fit = max(0, free // len(used) - one.shared) // one.memory * len(used)
-    if fit == 0:
+    """Raise `InputError` if members of `one` bytes do not fit into memory at once."""
+    used, config = devices[:num_members], algorithm.config
+    required = _padded(num_members, used) * one
+    if (free := available(used)) is not None and required > free:
+        # Each device trains the same number of members.
+        fit = max(0, free // len(used)) // one * len(used)
         raise InputError(
-            f"a single seed needs about {_in_words(one.memory + one.shared)} of "
-            f"memory, and {_in_words(free)} are free: most is for {one.largest_part}"
+            f"seeds are {num_members} (over all points): they need about "
+            f"{_in_words(required)} of memory, {_in_words(one)} each with num_envs "
+            f"{config.num_envs} and batch_steps {config.batch_steps}, and "
+            f"{_in_words(free)} are free: at most {fit} fit"
         )
-    config = algorithm.config
-    raise InputError(
-        f"seeds are {num_members} (over all points): they need about "
-        f"{_in_words(required)} of memory, {_in_words(one.memory)} each with num_envs "
-        f"{config.num_envs} and batch_steps {config.batch_steps}, and "
-        f"{_in_words(free)} are free: at most {fit} fit"
-    )
 
 
 def check_arrays(

@@ -100,10 +100,7 @@ def _equal(first: Columns, second: Columns) -> bool:
 
 
 def _curves(sweep: Sweep, every: Sequence[Columns]) -> Columns:
-    """Return all runs' columns, (points, seeds, rows).
-
-    A run has NaN after its last row, and where it lacks a metric of another agent.
-    """
+    """Return all runs' columns, (points, seeds, rows); NaN after a run's last row."""
     curves = {}
     for name in dict.fromkeys(name for own in every for name in own):
         columns = [own.get(name, np.empty(0)) for own in every]
@@ -128,13 +125,13 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     best = told["best_by_mean"]
     shown = 0 if best is None else best
     scores = {x: y[shown] for x, y in results.evaluations.items()}
-    title = ", ".join([sweep.env, *sweep.agent.split(",")])
+    title = f"{sweep.env}, {sweep.algorithm.agent.name}"
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
             results.metrics["env_steps"][shown, 0],
             results.metrics["episode_return"][shown],
-            title=f"{sweep.env}, {sweep.points[shown].get('agent', sweep.agent)}",
+            title=title,
             evaluations=scores or None,
         )
     if len(sweep.points) > 1:
@@ -199,7 +196,7 @@ def _summary(results: Results) -> dict[str, Any]:
 
     return {
         "env": sweep.env,
-        "agent": sweep.agent,
+        "agent": sweep.algorithm.agent.name,
         "env_steps_per_seed": int(np.nanmax(results.metrics["env_steps"])),
         "points": [
             {
@@ -219,21 +216,8 @@ def _summary(results: Results) -> dict[str, Any]:
             for i, point in enumerate(sweep.points)
         ],
         "best_by_mean": results.best(results.mean),
-        "best_of_agents": _best_of_agents(results),
         **_speed(trainings),
         "versions": _joined([x["versions"] for x in trainings]),
-    }
-
-
-def _best_of_agents(results: Results) -> dict[str, int | None]:
-    """Return the best point of each agent by mean; none for a single agent."""
-    own = np.array([str(point.get("agent")) for point in results.sweep.points])
-    return {
-        each.agent.name: results.best(
-            np.where(own == each.agent.name, results.mean, np.nan)
-        )
-        for each in results.sweep.algorithms
-        if results.sweep.others
     }
 
 
@@ -295,22 +279,12 @@ class _Best(TypedDict, total=False):
     """What other commands read of summary.json."""
 
     best_by_mean: int | None
-    best_of_agents: dict[str, int | None]
 
 
 def best_point(folder: pathlib.Path) -> int | None:
     """Return the point with the best mean, from summary.json; None if unknown."""
-    return _best(folder).get("best_by_mean")
-
-
-def best_of_agents(folder: pathlib.Path) -> dict[str, int]:
-    """Return the best point of each agent of a sweep over agents, if it is known."""
-    every = _best(folder).get("best_of_agents", {}).items()
-    return {agent: point for agent, point in every if point is not None}
-
-
-def _best(folder: pathlib.Path) -> _Best:
     try:
-        return json_files.read(folder / "summary.json", _Best)
+        best: _Best = json_files.read(folder / "summary.json", _Best)
     except FileNotFoundError:
-        return {}
+        return None
+    return best.get("best_by_mean")

@@ -25,8 +25,7 @@ _WAYS = ("physics",)
 class Run:
     """The settings that decide the numbers of one training run.
 
-    `start` is the hash of the policy that it starts from, if that is a trained one. The
-    physics engine and the device are not among them, because they compute the same
+    The physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -35,7 +34,6 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
-    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -62,7 +60,6 @@ class Run:
             settings[name] = float(settings[name])
         return {
             "env": self.env,
-            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": values,

@@ -39,14 +39,10 @@ from gasil_jax.host.sweep import Sweep
 
 
 def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Program]]:
-    """Return the environment's and the agent's name, and the programs of a point.
-
-    They have that point's runs alone. Only their tables can be read if Python alone can
-    make what was trained.
-    """
+    """Return the environment's and the agent's name, and the programs of a point."""
     stored = sweep.described(folder)
     chosen = _choose_point(folder, stored["points"], point)
-    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
+    agent = stored["algorithm"].get("agent")
     if stored["only_python"] is None:
         every = programs_of(folder, sweep.made(folder, stored), chosen)
     else:
@@ -118,11 +114,7 @@ def load(
     env: Any = None,
     algorithm: Algorithm | None = None,
 ) -> tuple[Any, Algorithm, list[int], Any]:
-    """Return environment, algorithm, seed numbers and states (seed, ...) of a point.
-
-    By default they are the best point by mean, all seeds, and the environment and the
-    algorithm that config.json describes; else see `load_policy`.
-    """
+    """Return environment, algorithm, seeds and states of a point; see `load_policy`."""
     for name, number in (("point", point), ("seed", seed)):
         if number is not None and number not in Range(-math.inf, whole=True):
             raise refusal(name, number, "a whole number")
@@ -187,27 +179,18 @@ def restore(
 
 
 def _read_checkpoint(root: pathlib.Path, which: str, like: Any) -> Any:
-    """Return the states in a checkpoint, which training may delete meanwhile."""
-    for _ in range(5):
-        before = set(root.iterdir()) if root.is_dir() else set()
-        errors: list[str] = []
-        try:
-            if which == "best":
-                chosen = checkpoint.best(root)
-            else:
-                chosen, errors = checkpoint.latest(root)
-            if chosen is None:
-                scored = " with a score" if which == "best" else ""
-                raise ValueError(f"it has no whole checkpoint{scored}")
-            states = chosen.restore(like)
-        except (ValueError, OSError):
-            if all(path.exists() for path in before):
-                raise
-        else:
-            for error in errors:
-                print(f"warning: {error}", file=sys.stderr)
-            return states
-    raise ValueError(f"training deletes {root} sooner than it can be read: try again")
+    """Return the states in a checkpoint."""
+    errors: list[str] = []
+    if which == "best":
+        chosen = checkpoint.best(root)
+    else:
+        chosen, errors = checkpoint.latest(root)
+    if chosen is None:
+        scored = " with a score" if which == "best" else ""
+        raise ValueError(f"it has no whole checkpoint{scored}")
+    for error in errors:
+        print(f"warning: {error}", file=sys.stderr)
+    return chosen.restore(like)
 
 
 def states_of(

@@ -138,11 +138,7 @@ def read(
     labels: Mapping[str, Sequence[int]],
     required: Sequence[str] = (),
 ) -> Columns:
-    """Return every metric of a `TableWriter`'s file, (members, iterations) each.
-
-    An empty cell is NaN. A last iteration that is incomplete is left out, because
-    training may be writing it; without a complete one the result is empty.
-    """
+    """Return a table's columns, (members, iterations), NaN where a cell is empty."""
     num_members = len(labels["seed"])
     header: list[str] = []
     cells = array.array("d")
@@ -157,6 +153,7 @@ def read(
                     cells.extend(float(x) if x else math.nan for x in row)
         if not (width := num_members * len(header)):
             return {}
+        # Training may be writing the last iteration.
         del cells[len(cells) // width * width :]
         values = np.array(cells).reshape(-1, num_members, len(header))
     except (ValueError, csv.Error) as error:

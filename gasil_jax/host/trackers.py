@@ -8,18 +8,15 @@ over the members, "episode_return/LABEL" and "evaluation/LABEL" are those of one
 
 import contextlib
 import importlib
-import netrc
 import os
 import pathlib
 import uuid
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol
-from urllib.parse import urlsplit
 
 import numpy as np
 
 from gasil_jax.errors import InputError
-from gasil_jax.host.output_file import note
 
 _Config = Mapping[str, Any]
 #: What each member has of its own, by its label.
@@ -83,8 +80,6 @@ class _WeightsAndBiases:
         try:
             self._runs = [
                 wandb.init(
-                    # By itself it would ask for a key while the run begins.
-                    mode="offline" if _lacks_key() else None,
                     project=os.environ.get("WANDB_PROJECT", "gasil_jax"),
                     group=os.environ.get("WANDB_RUN_GROUP", name),
                     name=f"{name}-{label}",
@@ -118,20 +113,6 @@ class _WeightsAndBiases:
             run.finish()
 
 
-def _lacks_key() -> bool:
-    """Return whether Weights & Biases would ask for an API key, so as to go online."""
-    if "WANDB_MODE" in os.environ or "WANDB_API_KEY" in os.environ:
-        return False
-    server = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai")
-    # `wandb login` keeps the key here.
-    path = os.environ.get("NETRC") or os.path.expanduser("~/.netrc")
-    try:
-        login = netrc.netrc(path).authenticators(urlsplit(server).hostname or "")
-    except (OSError, netrc.NetrcParseError):
-        return True
-    return login is None
-
-
 def _identifier(path: pathlib.Path) -> str:
     """Return the random identifier in a file, which is created if it is missing."""
     with contextlib.suppress(FileExistsError), path.open("x") as file:
@@ -150,27 +131,22 @@ TRACKERS: Mapping[str, tuple[str, Callable[..., Tracker]]] = {
 }
 
 
-def check(names: Sequence[str]) -> None:
+def check(setting: str, names: Sequence[str]) -> None:
     """Raise `ValueError` for a tracker that is unknown, not installed or repeated."""
     for name in names:
         if names.count(name) > 1:
-            raise ValueError(f"log has {name!r} twice: name it once")
+            raise ValueError(f"{setting} has {name!r} twice: name it once")
         if name not in TRACKERS:
             allowed = ", ".join(TRACKERS)
-            raise ValueError(f"log is {name!r}: it must be one of {allowed}")
+            raise ValueError(f"{setting} is {name!r}: it must be one of {allowed}")
         package = TRACKERS[name][0]
         try:
             importlib.import_module(package)
         except ImportError:
             raise ValueError(
-                f"log is {name!r}: it needs the package {package} "
+                f"{setting} is {name!r}: it needs the package {package} "
                 f'(pip install "gasil_jax[{name}]")'
             ) from None
-    if "wandb" in names and _lacks_key():
-        note(
-            "log is 'wandb' and there is no API key: the run is kept in its folder, "
-            "for `wandb sync` (`wandb login` beforehand logs online)"
-        )
 
 
 def make(

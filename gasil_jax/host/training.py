@@ -50,11 +50,6 @@ def prepare(
         _check(env, each)
     with announced(sweep.env, "tracing the first state"):
         resources.check(env, programs, sweep.recording, visible)
-    if num_devices is not None and 0 < num_members < num_devices:
-        note(
-            f"devices is {num_devices}, of which {num_members} are used, one for each "
-            "run"
-        )
     _note_if_no_episode_ends(env, [each.algorithm for each in programs])
     return env
 
@@ -101,11 +96,7 @@ def train_programs(
     callback: Callback | None = None,
     shown: bool = True,
 ) -> list[Outcome]:
-    """Train programs, one after the other, and return their outcomes.
-
-    Each program's folder is locked and lists its runs; once its training has ended it
-    has a training.json.
-    """
+    """Train programs, one after the other, in their folders; return their outcomes."""
     if not programs:
         return []
     num_members = sum(len(each.runs) for each in programs)
@@ -115,35 +106,31 @@ def train_programs(
     steps_before = 0
     points = {run.experiment for each in programs for run in each.runs}
     called = "seeds" if len(points) == 1 else "runs"
-    with Progress(
-        title, total_steps, num_members, members=called, shown=shown
-    ) as progress:
-        for each in programs:
-            if interruption.signal is not None:
-                raise Interrupted(interruption.signal)
-            members = make_members(
-                env, each.algorithm, each.seeds, each.hyperparameters
+    progress = Progress(title, total_steps, num_members, members=called, shown=shown)
+    for each in programs:
+        if interruption.signal is not None:
+            raise Interrupted(interruption.signal)
+        members = make_members(env, each.algorithm, each.seeds, each.hyperparameters)
+        with each.opened():
+            with progress.aside("starting the trackers"):
+                own = _trackers(recording.log, each)
+            outcome = driver.drive(
+                members,
+                each.path,
+                each.labels,
+                recording=recording,
+                progress=progress,
+                interruption=interruption,
+                steps_before=steps_before,
+                trackers=own,
+                callback=callback,
             )
-            with each.opened():
-                with progress.aside("starting the trackers"):
-                    own = _trackers(recording.log, each)
-                outcome = driver.drive(
-                    members,
-                    each.path,
-                    each.labels,
-                    recording=recording,
-                    progress=progress,
-                    interruption=interruption,
-                    steps_before=steps_before,
-                    trackers=own,
-                    callback=callback,
-                )
-                if outcome.unsaved is not None and len(programs) > 1:
-                    raise outcome.unsaved
-                if outcome.training["env_steps"] or each.training is None:
-                    each.finish(outcome.training)
-            outcomes.append(outcome)
-            steps_before += members.env_steps(members.config.num_iterations)
+            if outcome.unsaved is not None and len(programs) > 1:
+                raise outcome.unsaved
+            if outcome.training["env_steps"] or each.training is None:
+                each.finish(outcome.training)
+        outcomes.append(outcome)
+        steps_before += members.env_steps(members.config.num_iterations)
     return outcomes
 
 

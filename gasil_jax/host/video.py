@@ -40,12 +40,7 @@ Episode = Callable[[Mapping[str, Any], jax.Array], tuple[list[Any], float]]
 
 
 def make_episode(env: Any, *, num_steps: int, stochastic: bool = False) -> Episode:
-    """Return a function that runs an episode, given a policy's arrays and a key.
-
-    It returns the physics states, from the start on, and the true return. A step in
-    which the physics fails ends the episode; the step is left out of both. All policies
-    of the same shapes share one compiled step.
-    """
+    """Return a function of a policy and a key: the physics states and the return."""
     reset = jax.jit(env.reset)
 
     @jax.jit
@@ -60,6 +55,7 @@ def make_episode(env: Any, *, num_steps: int, stochastic: bool = False) -> Episo
         for step_key in jax.random.split(key, num_steps):
             observation, state = state.obs, step(weights, state, step_key)
             reward = state.info.get("true_reward", state.reward)
+            # A step in which the physics fails ends the episode, and is left out.
             if not wrappers.step_is_sound(observation, state):
                 break
             states.append(jax.device_get(state.pipeline_state))

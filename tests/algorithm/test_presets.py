@@ -65,7 +65,9 @@ def test_an_environment_of_ones_own_is_scaled_by_its_actions(agent, name):
     assert parse("point_mass", *words) == row
     assert parse("sparse:key_grid", *words) == row
     assert gasil_jax.preset("my:env", agent, name, action_size=1) == row
-    expected = presets.scaled(2, decompose_rewards=False)
+    expected = {**presets.scaled(2, decompose_rewards=False)}
+    if agent == ONE:
+        expected["entropy_coefficient"] = 0.01
     assert row == gasil_jax.algorithm(agent, **expected)
     with pytest.raises(ValueError, match="needs the dimension of my:env's actions"):
         gasil_jax.preset("my:env", agent, name)

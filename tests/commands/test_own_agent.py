@@ -145,8 +145,7 @@ def test_every_command_takes_it(tmp_path, capsys):
     results = tmp_path / "parts" / "results.csv"
     table = next((tmp_path / "parts").glob("programs/*/metrics.csv"))
     assert column(results, "my_weight") == {0.1, 0.3} > column(table, "my_weight")
-    (tmp_path / "points.json").write_text('[{"my_weight": 0.2}, {"gamma": 0.9}]')
-    words = [*SMALL, "--points-file", "points.json"]
+    words = [*SMALL, "--grid", "my_weight=0.2,0.5"]
     _, requested = options.read(options.SweepOptions, words, "x")
     (program,) = requested.unfinished(tmp_path)
     assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]

@@ -80,5 +80,5 @@ def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
     requested.write(out)
     (out / "programs").touch()
     arguments += ["--launcher", "ray", "--shards", "1", "--resume"]
-    assert sweep.main(arguments) == 2
-    assert "shard 1/1 (status 2): bad input" in capsys.readouterr().err
+    assert sweep.main(arguments) == 1
+    assert "shard 1/1 (status 2) failed, see above" in capsys.readouterr().err

@@ -69,12 +69,11 @@ mass --alpha LONGx | alpha is 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx
 mass --agent gail | expert is missing
 mass --agent gail --expert nowhere.npz | it must be an .npz file
 mass --agent gail --expert minari:nothing/there-v0 | minari:nothing/there-v0
-mass --agent gasil --preset scaled | it has ppo, ppo+novelty, ppo+gasil+n
+mass --agent gasil --preset scaled | it is for ppo, ppo+novelty, ppo+gasil+n
 corridor --policy-components 4 | policy_components is 4: it must be 1, the
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
 sweep --random 3 --grid alpha=0.1,0.2,0.1 | it must be from 1 to 2, of 2 points
-sweep --points-file no.json | no.json, which can't be read
 grid alhpa=1 | did you mean 'alpha'
 grid alpha=1 --agent ppo | gail, not of ppo. What can vary: batch_steps
 grid buffer_steps=9 --agent ppo+sil | buffer_steps is a setting of ppo+bc, ppo+bc+n
@@ -83,7 +82,6 @@ grid num_envs=1,2 | 'num_envs' can't vary: it must be one of batch_steps
 grid alpha=1,big | it must be numbers, like alpha=0.1,0.2
 grid buffer_steps=1.5 | whole numbers, like buffer_steps=10,20
 grid alpha=0.02,0.1 alpha=0.2 | grid has alpha twice
-grid alpha=1 --points-file x | points_file can't be combined with grid
 grid policy_components=1,4 --env sparse:key_grid | policy_components is 4: it must be 1
 grid alpha=1 --shard 1/1 | shard needs --out
 grid alpha=1 --shards 3 | shards is 3: it needs --launcher
@@ -93,11 +91,11 @@ shard --shard 1/2 | 1 runs (points x seeds) make 1
 shard --launcher ray | None: --launcher needs --shards
 shard --launcher ray --shards 2 | make 1 shards
 figure nonsense | experiment 'nonsense' is unknown: it must be one of
-figure matrix --shard 3/2 | --shard: invalid shard value: '3/2'
-figure matrix --devices 0 | --devices: 0: it must be 1 or more
+figure matrix --shard 3/2 | shard is '3/2': it must be NUMBER/COUNT
+figure matrix --devices 0 | devices is 0: it must be from 1 to
 figure matrix --quick --results x | results is x: --quick writes below
-figure report --help-me | unrecognized arguments: --help-me
-figure benchmark --tables speed | --tables: invalid choice: 'speed' (ch
+figure report --help-me | option --help-me is unknown: see --help
+figure benchmark --tables speed | tables is 'speed': it must be one of physics, training
 figure benchmark --repeats 9 --page | page is set, but
 evaluate | RUN is missing: see --help
 evaluate zoo:walker --gymnasium | policy of the zoo 'walker' is unknown: did
@@ -113,7 +111,7 @@ resume --gamma 0.5 | gamma was 0.98, is 0.5: only total_steps and seeds
 resume --obs-noise 0.2 --num-epochs 3 | num_epochs was 2, is 3
 resume --seeds 2 | seeds were [5, 6, 7]: only total_steps and seeds may
 resume --evaluate-every 300 | evaluate_every was 512, is 300
-score --checkpoint first | checkpoint is 'first': it must be one of last, be
+score --checkpoint first | checkpoint: invalid choice: 'first' (choose from
 score --episodes 1000000000000 | GB of memory
 score --seed 8 | seed is 8: the run has 5, 6, 7
 score --point 1 | point is 1: 
@@ -125,8 +123,6 @@ evaluate RUN/nowhere | does not exist: it must be the folder of a run or a sweep
 swept --point 4 | has points 0 to 3
 swept --point 1 --checkpoint best | it must be 'last'
 draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
-draw --smooth 0 | smooth is 0: it must be 1 or more
-draw --x steps | x 'steps' is unknown
 draw --out x.txt | must end in .png, .pdf, .svg
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png

@@ -14,7 +14,7 @@ from refusals import refused
 import gasil_jax
 from gasil_jax import sweep
 from gasil_jax.cli import options as options_
-from gasil_jax.cli import train as training_of_commands
+from gasil_jax.cli import run as training_of_commands
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
 from gasil_jax.host import programs, ray_launcher

@@ -167,7 +167,7 @@ def test_a_page_tells_shares_and_who_is_sooner(tmp_path):
     rows = {row.name: row for row in results.forest()}
     assert rows["novelty − ppo"].compared.middle == 1.0
     assert [*rows["novelty − ppo"].verdicts.values()] == ["better"] * 3
-    sooner = {row.name: row.compared for row in results.who_is_sooner()}
+    sooner = {row.name: row.compared for row in results.forest(sooner=True)}
     assert sooner["novelty − ppo"].middle == 0.5
     assert sooner["cloning − ppo"].verdict == "not clear"
     numbers = tables.numbers(results)
@@ -223,24 +223,63 @@ def test_a_claim_is_only_judged_when_its_cases_decide(verdicts, words):
     assert claims.verdict(pages, None) == ""
 
 
-def test_the_mean_over_tasks_stands_beside_them(tmp_path, monkeypatch):
+@pytest.fixture
+def rising(tmp_path):
+    """The results of three agents that begin with no return on three tasks."""
     units = {"hopper": 1000.0, "swimmer": 50.0, "ant": 10.0}
-    monkeypatch.setattr(figure_results, "unit", lambda env, store: units[env])
     arms = ["ppo", "ppo+bc", Arm("more", "ppo+gasil")]
     panels = grid([*units], arms, base=None, seeds=6)
     store = Store(tmp_path / "runs")
     for panel, curves in panels.items():
         for i, curve in enumerate(curves.values()):
-            runs = curve.runs(store)
-            store.add(dict.fromkeys(runs, constant(units[panel] * (1 + i))))
-    results = Results("x", Figure("", "", panels, favourite="more"), store)
-    whole = results.whole([*units])
-    assert [x[0] for x in whole.values()] == [1.0, 2.0, 3.0]
-    *drawn, last = [x for x in plots.curves(results).axes if x.get_visible()]
-    assert [x.get_title() for x in drawn] == [*units]
+            record = constant(units[panel] * (1 + i))
+            record.episode_return[0] = 0.0
+            store.add(dict.fromkeys(curve.runs(store), record))
+    return Results("x", Figure("", "", panels, favourite="more"), store)
+
+
+def test_the_mean_over_tasks_stands_beside_them(rising):
+    """A score is 0 at the start and 1 at the end of the best."""
+    whole = rising.whole()
+    assert [x[0] for x in whole.values()] == pytest.approx([1 / 3, 2 / 3, 1.0])
+    *drawn, last = [x for x in plots.curves(rising).axes if x.get_visible()]
+    assert [x.get_title() for x in drawn] == [*rising.figure.panels]
     assert [x.get_text() for x in last.texts] == [*whole]
     # Panels that share a task have no mean.
-    assert not results.whole(["hopper", "hopper", "ant"])
+    panels = dict.fromkeys(["one", "other"], rising.figure.panels["ant"])
+    figure = dataclasses.replace(rising.figure, panels=panels)
+    shared = Results("x", figure, rising.searched)
+    assert len(shared.scores) == 6 and not shared.whole()
+
+
+def test_families_of_tasks_stand_in_one_picture(rising):
+    assert [*figure_results.families([rising])] == ["dense"]
+    scores, ahead = [
+        x.get_lines() for x in plots.families([rising]).axes if x.get_visible()
+    ]
+    # An interval and its middle for each agent.
+    middles = [line.get_xdata() for line in scores[1::2]]
+    assert np.ravel(middles) == pytest.approx([1 / 3, 2 / 3, 1.0])
+    # The null, and an interval, its middle and no visible effect for each of two.
+    rows = [line.get_ydata()[0] for line in ahead[1:]]
+    assert sorted(set(rows)) == [0, 1]
+    text = report.value({"x": rising}, "families", "x")
+    assert "![" in text and "](x_families.png)" in text
+    assert "| ppo+bc | 0.67 [0.67, 0.67] |" in text
+    assert "| ppo | 1.00 [1.00, 1.00], better |" in text
+    assert [*report.pictures({"x": rising}, "{{families x}}")] == ["x_families.png"]
+
+
+def test_what_was_asked_stands_beside_what_came_out(rising):
+    value = functools.partial(report.value, {"x": rising}, "x")
+    assert value("likely", "more", "ppo", "dense", "0.9").endswith("better, reached")
+    assert value("likely", "more", "ppo", "dense", "1.1").endswith("**not reached**")
+    on = value("tasks", "not clear", "dense", "more", "ppo")
+    assert on == "hopper, swimmer, ant"
+    assert value("tasks", "worse", "", "more", "ppo") == "none"
+    assert value("tasks", "worse", "raw", "more", "ppo") == "not measured"
+    _, _, tasks, own = value("rule", "more", "dense").splitlines()
+    assert tasks == "| hopper, swimmer, ant |  |" and "alpha 0.1" in own
 
 
 def test_one_point_is_chosen_for_all_sparse_tasks(tmp_path):
@@ -265,10 +304,17 @@ def test_one_point_is_chosen_for_all_sparse_tasks(tmp_path):
 
 #: What may stand in a note in digits: settings, and names.
 _SETTINGS = (
-    *("walker2d", "`[^`]*`", "[Ff]igures? [2-8](?: (?:and|to) [2-8])?", r"\dM steps"),
+    *(
+        "walker2d",
+        "deep_sea_[12]0",
+        "[568]x[568]",
+        "`[^`]*`",
+        "[Ff]igures? [2-8](?: (?:and|to) [2-8])?",
+        r"\dM steps",
+    ),
     *("table 1", r"to 0\.02 at 3M", "is 0 until", '"from-2M"', r"\b20 steps", "95%"),
     *("delay 10*", "delay of 1000", "delay 20", r"alpha 0\.02", "32\\s+environments"),
-    *("30,000 steps", "128 drawn", "1,000 steps", "buffer of 500", "1: PPO"),
+    *("30,000 steps", "128 drawn", "1,000 steps", "buffer of 500"),
 )
 _NOTES = {x.stem: x.read_text() for x in sorted(report.NOTES.glob("*.md"))}
 

@@ -2,12 +2,10 @@
 
 import errno
 import fcntl
-import io
 import os
 import re
 import resource
 import shutil
-import sys
 from unittest import mock
 
 import jax
@@ -18,7 +16,6 @@ from test_resume import program_of
 
 import gasil_jax
 from gasil_jax import run
-from gasil_jax.cli import reporting
 from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint, folders, output_file, saved, tables
 
@@ -39,14 +36,6 @@ def test_a_folder_has_any_name(tmp_path):
     assert run.main([*SMALL, f"--out={out}"]) == 0
     states = saved.load(out)[-1]
     np.testing.assert_array_equal(states.iteration, [PPO.config.num_iterations])
-
-
-def test_a_name_that_the_terminal_cannot_show_is_printed(monkeypatch):
-    written = io.BytesIO()
-    strict = io.TextIOWrapper(written, encoding="ascii", write_through=True)
-    monkeypatch.setattr(sys, "stdout", strict)
-    assert reporting.reports_errors(lambda: print("in \udcffé") or 0)() == 0
-    assert written.getvalue() == b"in \\udcff\\xe9\n"
 
 
 def test_a_file_system_without_locks_is_told(tmp_path, monkeypatch, capsys):

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import threading
 
 import jax
@@ -12,7 +10,7 @@ from small_training import FLAGS
 from test_progress import wait_for_text
 
 from gasil_jax import run
-from gasil_jax.host import checkpoint, driver, folders, interruption
+from gasil_jax.host import checkpoint, folders, interruption
 
 
 @pytest.fixture(autouse=True)
@@ -21,41 +19,6 @@ def as_in_a_terminal():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
-
-
-@pytest.mark.parametrize("module", ["gasil_jax.run", "experiments"])
-def test_ctrl_c_during_imports_is_one_line(module, tmp_path):
-    # What the commands import first, here with Ctrl-C in it; some code passes that by.
-    numpy = """
-try:
-    import os, signal
-    os.kill(os.getpid(), signal.SIGINT)
-except BaseException:
-    pass
-raise ImportError
-"""
-    (tmp_path / "numpy.py").write_text(numpy)
-    path = os.pathsep.join([str(tmp_path), *sys.path])
-    ended = subprocess.run(
-        [sys.executable, "-m", module],
-        env=os.environ | {"PYTHONPATH": path},
-        capture_output=True,
-        text=True,
-    )
-    assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
-
-
-def test_only_commands_of_the_package_take_ctrl_c_for_themselves(monkeypatch):
-    cases = {
-        ("-m", "-m theirs"): False,
-        ("theirs.py", "theirs.py"): False,
-        ("/gasil_jax/run.py", "-m gasil_jax.run"): False,
-        ("-m", "-m gasil_jax.run"): True,
-    }
-    for (first, given), ours in cases.items():
-        monkeypatch.setattr(sys, "argv", [first])
-        monkeypatch.setattr(sys, "orig_argv", ["python", *given.split()])
-        assert interruption.runs_as_program("gasil_jax") is ours
 
 
 @pytest.mark.parametrize("twice", [False, True])
@@ -70,7 +33,7 @@ def test_ctrl_c_while_compiling_is_answered_at_once(
         assert threading.current_thread() is not threading.main_thread()
         os.kill(os.getpid(), signal.SIGINT)
         told = ""
-        while driver._AFTER_COMPILATION not in told:
+        while interruption.ANSWER not in told:
             more = wait_for_text(capsys)
             assert more
             told += more

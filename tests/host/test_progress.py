@@ -1,13 +1,10 @@
-"""Progress messages where there is no terminal."""
+"""Progress messages."""
 
-import functools
-import io
 import threading
 import time
 
 import numpy as np
 import pytest
-import rich.console
 
 from gasil_jax.host import progress
 
@@ -50,37 +47,15 @@ def test_a_quick_phase_is_not_announced(monkeypatch, capsys):
 def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     clock = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    with progress.Progress("hopper ppo", 2000) as shown:
-        shown.phase("training")
-        clock[0] += 10.0
-        with shown.aside("saving a checkpoint"):
-            clock[0] += 90.0
-        clock[0] += 10.0
-        shown.update(2000, np.array([[3.0, np.nan]]))
+    shown = progress.Progress("hopper ppo", 2000)
+    shown.phase("training")
+    clock[0] += 10.0
+    with shown.aside("saving a checkpoint"):
+        clock[0] += 90.0
+    clock[0] += 10.0
+    shown.update(2000, np.array([[3.0, np.nan]]))
     lines = capsys.readouterr().err.splitlines()
     assert lines[0] == "hopper ppo: training"
     assert lines[1] == (
         "hopper ppo: 2,000/2,000 steps, return 3.0, 100 steps/s, 0:00:00 left"
     )
-
-
-def test_at_80_columns_only_the_bar_gives_way(monkeypatch):
-    shown, clock = io.StringIO(), [0.0]
-    console = functools.partial(
-        rich.console.Console, file=shown, force_terminal=True, width=80, no_color=True
-    )
-    monkeypatch.setattr(progress, "Console", lambda stderr: console())
-    monkeypatch.setattr(time, "monotonic", lambda: clock[0])
-    with progress.Progress("halfcheetah ppo+gasil sweep", 10**9, 100) as bar:
-        with bar.aside("compiling"):
-            clock[0] += 65.0
-            bar._bar.refresh()
-        assert "compiling (65 s)" in shown.getvalue()
-        bar.phase("training")
-        clock[0] += 1000.0
-        bar.update(10**8, np.array([[-12345.6], [12345.6]]))
-    lines = shown.getvalue().splitlines()
-    assert "halfcheetah ppo+gasil sweep: 10,000,000 steps x 100 seeds" in lines[0]
-    (last,) = [line for line in lines[-2:] if "%" in line]
-    assert " 10% " in last and "━" in last
-    assert "return 0.0, 100,000 steps/s, 2:30:00 left" in last

@@ -24,8 +24,7 @@ from test_checkpoints import assert_same
 from gasil_jax import run
 from gasil_jax.cli import reporting
 from gasil_jax.errors import InputError
-from gasil_jax.host import checkpoint, devices, folders
-from gasil_jax.host.environments import Settings
+from gasil_jax.host import checkpoint, folders
 from gasil_jax.host.members import Members
 
 ITERATIONS = 160
@@ -206,15 +205,6 @@ def test_ctrl_c_before_training_is_one_line(capsys):
 
     assert reporting.reports_errors(work)() == 130
     assert capsys.readouterr().err == "interrupted\n"
-
-
-def test_devices_without_effect_are_told(capsys):
-    """JAX has been started by the tests, with two."""
-    devices.use_devices(Settings(), 1, 4)
-    assert "devices is 1, which has no effect: JAX is" in capsys.readouterr().err
-    devices.use_devices(Settings(), None, 1)
-    devices.use_devices(Settings(), 2, 4)
-    assert capsys.readouterr().err == ""
 
 
 def test_a_new_folder_has_a_name_of_its_own(tmp_path, monkeypatch):

@@ -105,6 +105,7 @@ def test_a_program_of_a_sweep_is_told_with_its_own_values(
     tmp_path, monkeypatch, capsys
 ):
     """And with the name of the sweep's folder."""
+    pytest.importorskip("tensorboardX")
     monkeypatch.chdir(tmp_path)
     told = []
 
@@ -113,40 +114,9 @@ def test_a_program_of_a_sweep_is_told_with_its_own_values(
         raise InputError("enough")
 
     monkeypatch.setattr(trackers, "make", make)
-    monkeypatch.setattr(trackers, "check", lambda names: None)
     grid = ("--grid", "num_epochs=2,3", "--out", "programs/7")
     refused(capsys, sweep, *SMALL, "--log", "tensorboard", *grid)
     assert told == [("7", 2)]
-
-
-def test_wandb_is_offline_where_it_would_ask_for_a_key(tmp_path, monkeypatch, capsys):
-    """A stand-in tells how it was started; other files and settings are a user's."""
-    modes = []
-    wandb = types.ModuleType("wandb")
-    wandb.init = lambda **settings: modes.append(settings["mode"])
-    monkeypatch.setitem(sys.modules, "wandb", wandb)
-    for name in ("WANDB_MODE", "WANDB_API_KEY", "WANDB_BASE_URL", "NETRC"):
-        monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv("HOME", str(tmp_path))
-
-    def started():
-        trackers.check(["wandb"])
-        one = {"3": {}}
-        trackers.make(["wandb"], tmp_path, run_name="alpha-2", config={}, members=one)
-        return modes.pop(), capsys.readouterr().err
-
-    mode, printed = started()
-    assert mode == "offline" and "no API key" in printed
-    assert len(printed.splitlines()) == 1
-    with monkeypatch.context() as patch:
-        patch.setenv("WANDB_API_KEY", "key")
-        assert started() == (None, "")
-    login = "machine api.wandb.ai\n  login user\n  password key\n"
-    (tmp_path / ".netrc").write_text(login)
-    assert started() == (None, "")
-    # The key is of another server.
-    monkeypatch.setenv("WANDB_BASE_URL", "https://wandb.example.org")
-    assert started()[0] == "offline"
 
 
 def test_wandb_without_a_login_is_one_line(tmp_path, monkeypatch, capsys):
