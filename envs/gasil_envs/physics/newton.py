@@ -360,6 +360,13 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         slope = system.store(system.times(direction))
         linear = dot(direction, residual)
         quadratic = dot(direction, system.inertia_times(direction))
+        size = dot(smooth, system.force)
+        size += dot(qacc, each(jnp.add, residual, system.force))
+
+        def moves(far: Any, step: jax.Array) -> jax.Array:
+            """Whether a step is more than the rounding of accelerations."""
+            far &= step * step * quadratic > 1e-11 * size
+            return system.differ(far, far & False)
 
         def search_step(search: Any) -> Any:
             (step, is_newton), low, high, before = search
@@ -377,11 +384,11 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
             goes_on = system.differ(before, now)
-            if thorough:  # Half of the way is no step to end with.
-                goes_on |= system.differ(is_newton, is_newton | True)
             if has_cones:
-                far = jnp.abs(following - step) > 0.01 * step
-                goes_on |= system.differ(far, far & False)
+                change = following - step
+                goes_on |= moves(jnp.abs(change) > 0.01 * step, change)
+            elif thorough:  # Half of the way is no step to end with.
+                goes_on |= system.differ(is_newton, is_newton | True)
             return ((following, inside), low, high, now), goes_on
 
         step, before = jnp.ones_like(linear), of_rows(_piece, jaref)
@@ -395,9 +402,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
         )
         goes_on = system.differ(before, of_rows(_piece, moved))
         if has_cones:  # Their cost is not quadratic.
-            size = dot(qacc, system.inertia_times(qacc)) + dot(smooth, system.force)
-            far = step * step * quadratic > 1e-11 * size
-            goes_on |= system.differ(far, far & False)
+            goes_on |= moves(True, step)
         return (qacc, moved), goes_on
 
     start = each(choose, (warmstart, at_warmstart), (smooth, at_smooth))

@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import mujoco
 
-from gasil_envs.physics import dynamics, tree
+from gasil_envs.physics import dynamics, tendons, tree
 from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
@@ -74,13 +74,15 @@ class JaxPhysics:
 
     @property
     def warnings(self) -> list[str]:
-        """Return the parts of the model that float32 resolves too little of."""
+        """Return what differs: of the model, mostly what float32 does not resolve."""
         own, parts = self._dynamics, []
         if own.layout.stiffness > 3e3:
             parts.append(
                 f"contacts, which are {own.layout.stiffness:.0e} times as stiff as "
                 "what they move (by friction, impratio or solimp)"
             )
+        if "cfrc_ext" in own.fields and tendons.strings(own.model).any():
+            parts.append("cfrc_ext, which is without the forces of spatial tendons")
         return parts + tree.rounding(own.model)
 
     @full_precision
