@@ -160,17 +160,12 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
     stepped = _traced(name, env, "step", bare, action)
     for state, where in ((bare, "reset"), (stepped, "step")):
         fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
-        of_info = {
-            f"info[{x!r}]": state.info[x]
-            for x in ("truncation", "true_reward")
-            if x in state.info
-        }
+        names = {"truncation", "true_reward"} & {*state.info}
+        of_info = {f"info[{x!r}]": state.info[x] for x in sorted(names)}
         for field, value in (fields | of_info).items():
-            shape: tuple[int, ...] = ()
-            why = ""
-            if field == "obs":
-                shape = (size,)
-                why = f", as observation_size is {size}"
+            is_obs = field == "obs"
+            shape = (size,) if is_obs else ()
+            why = f", as observation_size is {size}" if is_obs else ""
             is_array = hasattr(value, "shape")
             if not is_array or value.shape != shape:
                 kind = type(value).__name__

@@ -76,8 +76,7 @@ def _pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
         if is_parent and weld_a and weld_b and not parents_collide:
             continue
         for g1, g2 in itertools.product(geoms_of[a].tolist(), geoms_of[b].tolist()):
-            pair = _in_order(model, g1, g2)
-            g1, g2 = pair
+            g1, g2 = pair = _in_order(model, g1, g2)
             mask = (model.geom_contype[g1] & model.geom_conaffinity[g2]) | (
                 model.geom_contype[g2] & model.geom_conaffinity[g1]
             )

@@ -33,6 +33,7 @@ from gasil_envs.physics.batching import (
 _MOST_STIFFNESS = 1e5
 # The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1, 1), (1, -1), (1, 0))
+_ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
 class Impedance(struct.PyTreeNode):
@@ -204,13 +205,9 @@ class Contacts(NamedTuple):
     constants: Constants
 
 
-def _is_elliptic(model: mujoco.MjModel) -> bool:
-    return model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC
-
-
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `layout` can't describe this model, or None if it can."""
-    if _is_elliptic(model) and model.pair_solreffriction.any():
+    if model.opt.cone == _ELLIPTIC and model.pair_solreffriction.any():
         return "it has pairs of geoms with solreffriction"
     allowed = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
     if not np.isin(model.eq_type[model.eq_active0.astype(bool)], allowed).all():
@@ -311,7 +308,7 @@ def _group(
     motion_normal: np.ndarray | None,
 ) -> Group:
     flat = motion_normal is not None and condim == 3
-    elliptic = _is_elliptic(model) and condim > 1
+    elliptic = model.opt.cone == _ELLIPTIC and condim > 1
     edges = _edges(condim, flat=flat, elliptic=elliptic)
     chosen = np.flatnonzero(contact.dim == condim)
     pairs, index = collision.pairs(
@@ -345,7 +342,6 @@ def _group(
         moved = moved * max(scale, 1.0)
         ratio = sliding / np.float32(np.sqrt(scale))
         friction = friction / ratio[:, None]
-        ratio = _constant(ratio)
     elif condim > 1:
         moved, inverse_weight = (x * (1 + sliding**2) for x in (moved, inverse_weight))
         inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
@@ -363,7 +359,7 @@ def _group(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
         body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),
         friction=_constant(friction),
-        ratio=ratio,
+        ratio=None if ratio is None else _constant(ratio),
         margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
         least_resistance=_constant(floor),

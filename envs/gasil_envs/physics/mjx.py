@@ -46,8 +46,7 @@ def left_out(model: mujoco.MjModel) -> str | None:
     for what, names in _LEFT_OUT.items():
         if any(np.any(getattr(model, name)) for name in names):
             return what
-    options = ("noslip_iterations", "disableactuator")
-    for option in options:
+    for option in ("noslip_iterations", "disableactuator"):
         if getattr(model.opt, option):
             return option
     flags = model.opt.enableflags & ~(_WITHOUT_EFFECT | _ENABLE.mjENBL_INVDISCRETE)
