@@ -43,7 +43,7 @@ from flax import struct
 from gasil_jax.agents.adversarial import BONUSES, PPOGASIL
 from gasil_jax.agents.novelty import TIE, PPONovelty, Visits
 from gasil_jax.buffer import GoodTrajectories, mean_return
-from gasil_jax.config import choice
+from gasil_jax.config import choice, number
 from gasil_jax.context import Context, Metrics, Sizes
 from gasil_jax.learner import Learner
 from gasil_jax.rollout import Rollout
@@ -145,6 +145,7 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
 
     name = "ppo+gasil+novelty"
 
+    alpha: float = number(0.05, 0.0)
     bonus: str = choice("centered", BONUSES)
 
     def init(self, key: jax.Array, sizes: Sizes) -> Any:
