@@ -17,6 +17,7 @@ Shape letters: C contacts, A axes, B batch.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -320,23 +321,13 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
         columns, up = lines.columns[solid], np.eye(3, dtype=np.float32)[..., None]
         size = model.geom_size[solid].astype(np.float32)[:, None]
         is_round = model.geom_type[solid] == _CYLINDER
-
-        def local(x: jax.Array, columns: list[jax.Array] = columns) -> jax.Array:
-            return stacked([total(column * x) for column in columns])
-
-        def nearest(
-            x: jax.Array, is_round: Any = is_round, size: np.ndarray = size
-        ) -> jax.Array:
-            """Return the point of the solid that is nearest to x."""
-            if not is_round:
-                return jnp.clip(x, -size, size)
-            within = jnp.minimum(size[0] / jnp.maximum(_length(x[:2]), 1e-15), 1.0)
-            flat = jnp.clip(x[2], -size[1], size[1])
-            return jnp.stack([x[0] * within, x[1] * within, flat])
-
-        centre = local(lines.middle[geom] - lines.middle[solid])
+        nearest = functools.partial(_nearest, size, is_round)
+        centre, half = (
+            stacked([total(column * x) for column in columns])
+            for x in (lines.middle[geom] - lines.middle[solid], lines.half[geom])
+        )
         if model.geom_type[geom] == _CAPSULE:
-            centre = _nearest_on_line(nearest, centre, local(lines.half[geom]))
+            centre = _nearest_on_line(nearest, centre, half)
         away = nearest(centre) - centre
         apart = _length(away)
         sides = list(zip(centre, size, up, strict=True))
@@ -365,6 +356,15 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
 
 def _length(x: jax.Array) -> jax.Array:
     return jnp.sqrt(total(x**2))
+
+
+def _nearest(size: np.ndarray, is_round: bool, x: jax.Array) -> jax.Array:
+    """Return the point of a cylinder or a box that is nearest to x, (3, B)."""
+    if not is_round:
+        return jnp.clip(x, -size, size)
+    within = jnp.minimum(size[0] / jnp.maximum(_length(x[:2]), 1e-15), 1.0)
+    flat = jnp.clip(x[2], -size[1], size[1])
+    return jnp.stack([x[0] * within, x[1] * within, flat])
 
 
 def _nearest_on_line(
