@@ -468,7 +468,7 @@ def test_host_physics_in_nested_batches_and_a_scan_is_plain_mujoco(fields):
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=3))
     physics = native.MujocoPhysics(model, fields, threads=2)
     angle = jnp.linspace(-1.0, 1.0, 6).reshape(2, 3, 1)
-    state = jax.vmap(jax.vmap(physics.init))(angle, 0.5 * angle)
+    state = PhysicsState(angle, 0.5 * angle, 0.0 * angle)
     control = jnp.float32([0.7])
 
     def body(state, _):
@@ -495,7 +495,7 @@ def test_host_physics_in_nested_batches_and_a_scan_is_plain_mujoco(fields):
 def test_a_simulation_that_fails_is_nan_and_harms_no_other(fields, capfd):
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=1))
     physics = native.MujocoPhysics(model, fields, threads=2)
-    state = jax.vmap(physics.init)(jnp.zeros((4, 1)), jnp.zeros((4, 1)))
+    state = PhysicsState(*(jnp.zeros((4, 1)) for _ in range(3)))
     # MuJoCo warns, and puts it back at the start.
     state = state.replace(qvel=state.qvel.at[2].set(1e12))
     # What has failed before is not simulated again, which would print a warning.
