@@ -12,7 +12,6 @@ from typing import Any
 
 from experiments import (
     benchmark,
-    doing_nothing,
     engine,
     profile,
     report,
@@ -36,7 +35,6 @@ COMMANDS: Mapping[str, ModuleType] = {
     "benchmark": benchmark,
     "profile": profile,
     "zoo": zoo,
-    "doing_nothing": doing_nothing,
 }
 #: Environment steps of each run of `--quick`.
 _QUICK_STEPS = 100_000
@@ -97,14 +95,7 @@ def _small(figure: Figure, names: Sequence[str]) -> Figure:
         panel: {name: small(curve) for name, curve in curves.items()}
         for panel, curves in selected.panels.items()
     }
-    comparisons = figure.comparisons and {
-        names: terms
-        for names, terms in figure.comparisons.items()
-        if all(panel in panels for _, panel, _ in terms)
-    }
-    return dataclasses.replace(
-        figure, panels=panels, searches={}, comparisons=comparisons
-    )
+    return dataclasses.replace(figure, panels=panels, searches={})
 
 
 def _train(name: str, options: Options) -> None:

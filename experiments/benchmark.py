@@ -87,17 +87,7 @@ class Options:
 
 @dataclasses.dataclass
 class Row:
-    """One line of a table.
-
-    Attributes:
-      env: name of the task.
-      name: what is measured.
-      num_envs: number of environments that are stepped at once.
-      run: takes some steps and returns how many per second.
-      compile_seconds: time of compiling; 0 if nothing is compiled.
-      error: relative error of one step; None if it is not measured.
-      speed: steps per second, the median of the repeats, once it is measured.
-    """
+    """One line of a table."""
 
     env: str
     name: str
@@ -237,10 +227,7 @@ def warp_row(env_name: str, num_envs: int) -> Row:
 
 
 def one_step_error(env_name: str, variant: str) -> float:
-    """Return the relative error of an observation after one step from the same states.
-
-    It is the error of the worst entry, and the median over 64 environments.
-    """
+    """Return the median, over states, of a step's worst error relative to C MuJoCo."""
     env, reference = make(env_name, variant), make(env_name, "mujoco")
     keys = jax.random.split(jax.random.key(1), 64)
     states = jax.jit(jax.vmap(reference.reset))(keys)
@@ -328,10 +315,7 @@ def _train_baseline(
 def baseline_row(
     env_name: str, runs: int, num_envs: int, *, spread: bool = False
 ) -> Row:
-    """Stable-Baselines3's PPO: `runs` at once, each of `num_envs` environments.
-
-    If they are spread, each environment has its own process; otherwise a run is one.
-    """
+    """Stable-Baselines3's PPO, a process for each run or, spread, for each env."""
     task = gasil_envs.make(env_name).unwrapped.task.gymnasium_id
     context = multiprocessing.get_context("spawn")
     threads = max(1, available_cores() // runs)

@@ -90,10 +90,7 @@ def judged(effects: Mapping[Any, Effect], dropped: int = 0) -> dict[Any, Compari
 
 
 def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, float]:
-    """Return the p-values of a family, corrected by Holm's method.
-
-    Those that are dropped, because their runs are, count as if they were the largest.
-    """
+    """Return p-values corrected by Holm's method, as if `dropped` more were larger."""
     higher, least = {}, 0.0
     for i, key in enumerate(sorted(p_values, key=lambda key: p_values[key])):
         least = max(least, min(1.0, p_values[key] * (len(p_values) + dropped - i)))
@@ -102,10 +99,7 @@ def corrected(p_values: Mapping[Any, float], dropped: int = 0) -> dict[Any, floa
 
 
 def visible_effect(drawn: np.ndarray, comparisons: int) -> float:
-    """Return the smallest true effect that would be found with a probability of 80%.
-
-    The level of the test is `LEVEL` / `comparisons`, as for Holm's smallest p-value.
-    """
+    """Return the effect that is found with a probability of 80%, by Holm's method."""
     quantile = statistics.NormalDist().inv_cdf
     errors = quantile(1 - LEVEL / (2 * comparisons)) + quantile(_POWER)
     return errors * float(np.std(drawn))
@@ -125,10 +119,7 @@ def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
 
 @functools.cache
 def _splits(first: int, seeds: int) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return ways to split seeds in two, (ways, seeds of a side), and if all are there.
-
-    All ways if they are few, else random ones. The numbers of the seeds ascend.
-    """
+    """Return ways to split seeds, (ways, seeds of a side), and if these are all."""
     exact = math.comb(seeds, first) <= _MOST_SPLITS
     if exact:
         ways = itertools.combinations(range(seeds), first)
@@ -248,10 +239,7 @@ def _resampled(size: int, rng: np.random.Generator) -> np.ndarray:
 
 @functools.cache
 def fisher_p(ours: int, our_seeds: int, other: int, other_seeds: int) -> float:
-    """Return the p-value of Fisher's exact test, two-sided.
-
-    `ours` of our seeds and `other` of the other curve's solve the task.
-    """
+    """Return Fisher's exact p-value, two-sided, of how many seeds solve a task."""
     solved, seeds = ours + other, our_seeds + other_seeds
 
     def ways(x: int) -> int:
@@ -316,10 +304,7 @@ def over_tasks(name: str, scores: Sequence[np.ndarray]) -> tuple[float, float, f
 
 
 def mean_share(solved: Sequence[np.ndarray]) -> tuple[float, float, float]:
-    """Return the mean share of solving seeds over tasks, and its bootstrap interval.
-
-    `solved` says of each task which seeds solve it, bool (seeds,).
-    """
+    """Return the mean over tasks of the share of seeds that solve, and its interval."""
     rng = np.random.default_rng(0)
     drawn = [rng.binomial(len(x), x.mean(), _DRAWS) / len(x) for x in solved]
     low, high = np.percentile(np.mean(drawn, axis=0), [2.5, 97.5])

@@ -64,10 +64,7 @@ class Curve:
 
     @property
     def family(self) -> tuple[bool, bool, bool]:
-        """Whether rewards are delayed and raw, and whether the agent is the paper's.
-
-        Comparisons of curves that differ in none of these are a family.
-        """
+        """Whether rewards are delayed and raw, and whether the agent is the paper's."""
         search = self.search
         raw = not getattr(search, "normalize_rewards", True)
         sees_phase = self.settings.get("observe_phase", False)
@@ -76,10 +73,7 @@ class Curve:
         return self.reward_delay > 1, raw, own and self.agent in PAPERS
 
     def point(self, searched: Store) -> Point | None:
-        """Return the settings that differ from the defaults or the preset.
-
-        They are None if the curve's search is not complete in the store `searched`.
-        """
+        """Return the changed settings, or None if the curve's search lacks runs."""
         chosen = self.search.chosen(searched) if self.search else {}
         return None if chosen is None else {**chosen, **self.changes}
 
@@ -202,7 +196,8 @@ class Figure:
     def compared(self) -> Comparisons:
         """Return all comparisons of the figure."""
         if self.comparisons is not None:
-            return self.comparisons
+            every, own = self.comparisons.items(), self.panels.keys()
+            return {x: terms for x, terms in every if own >= {p for _, p, _ in terms}}
         compared: dict[tuple[str, ...], Terms] = {}
         for panel, curves in self.panels.items():
             pairs = self.pairs or [
@@ -216,11 +211,7 @@ class Figure:
         return compared
 
     def families(self) -> list[Comparisons]:
-        """Return the comparisons in families, each corrected on its own.
-
-        Comparisons with dense and with delayed rewards, those with normalized and with
-        raw ones, and those among the paper's agents and others are separate families.
-        """
+        """Return the comparisons by `Curve.family`; each family is corrected alone."""
         families: dict[Any, dict[tuple[str, ...], Terms]] = {}
         for key, terms in self.compared().items():
             curves = [

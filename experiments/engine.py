@@ -46,7 +46,6 @@ _WRITTEN = (
 #: The file of a scratch folder that says how each session trained.
 _SESSIONS = "provenance.json"
 _HOW_TO_CONTINUE = "continue with: the same command and --resume"
-_ENDING = "waiting until all processes have saved; Ctrl-C again quits now"
 _SECONDS_BETWEEN_POLLS = 1.0
 
 
@@ -79,20 +78,13 @@ class Setup:
 
     @property
     def scratch(self) -> pathlib.Path:
-        """The folder of the programs in training.
-
-        Physics and evaluations are not in a run's key, but its tables depend on them.
-        """
+        """The folder of programs in training; their tables depend on what it names."""
         return self.runs / f"{self.physics}-{self.evaluate_episodes}"
 
 
 @functools.cache
 def source(commit: str | None) -> dict[str, Any]:
-    """Return the checkout's commit, and whether its files are unchanged.
-
-    Files that experiments write do not count as changed. Without a repository the
-    commit is the one that is given, and nobody knows what has changed.
-    """
+    """Return the checkout's commit, and whether it has changes of other files."""
 
     def git(*arguments: str) -> str:
         command = ("git", "-C", str(pathlib.Path(__file__).parent.parent), *arguments)
@@ -127,10 +119,7 @@ def select_by_key(runs: Iterable[Run], number: int, count: int) -> list[Run]:
 
 
 def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
-    """Return the programs to train: those that have begun, then the most important.
-
-    The first of the missing runs is the most important one.
-    """
+    """Return the programs to train: those that have begun, then by their first run."""
     rank = {run: rank for rank, run in enumerate(missing)}
     # The order in which runs are missing does not change a program.
     ordered = sorted(rank, key=lambda run: run.key)
@@ -146,13 +135,7 @@ def unfinished(missing: Sequence[Run], setup: Setup) -> list[Program]:
 
 
 def train(stored: Program, setup: Setup) -> dict[Run, Record]:
-    """Train a program, or continue its training, and return its runs' records.
-
-    Raises:
-      InputError: if it does not fit into memory or on the disk, or if another process
-        trains it.
-      Interrupted: if a signal was received; a checkpoint was written first.
-    """
+    """Train a program, or continue its training, and return its runs' records."""
     run = stored.runs[0]
     of_search = run.seed in FINALIST_SEEDS
     episodes = None if of_search else setup.evaluate_episodes or None
@@ -224,10 +207,7 @@ def record(
     evaluations: Mapping[str, np.ndarray],
     provenance: Mapping[str, Any],
 ) -> Record:
-    """Return a run's record from the columns of its tables, (rows,) each.
-
-    There may be no evaluations.
-    """
+    """Return a run's record from the columns of its tables, (rows,) each."""
     steps = metrics["env_steps"]
     parts = [x for x in np.array_split(np.arange(len(steps)), ROWS) if len(x)]
 
@@ -267,13 +247,7 @@ def _requested(missing: Sequence[Run], store: Store, setup: Setup) -> list[Progr
 
 
 def train_missing(missing: Sequence[Run], store: Store, setup: Setup) -> None:
-    """Train runs and add them to the store, each program as soon as it has ended.
-
-    Raises:
-      InputError: if the scratch folder holds training of these runs and `Setup.resume`
-        is not set.
-      Interrupted: if a signal was received; a checkpoint was written first.
-    """
+    """Train runs and add them to the store, each program as soon as it has ended."""
     for stored in _requested(missing, store, setup):
         # Another process may have added them since.
         if Store(store.folder).missing(stored.runs):
@@ -295,7 +269,6 @@ def _train_on_core(core: int, stored: Program, setup: Setup, folder: Any) -> Non
 
 def _end(processes: Collection[Any]) -> None:
     """End processes, and wait until they have saved; a second Ctrl-C kills them."""
-    print(_ENDING, file=sys.stderr, flush=True)
     try:
         while alive := [x for x in processes if x.is_alive()]:
             for process in alive:
@@ -309,16 +282,7 @@ def _end(processes: Collection[Any]) -> None:
 def train_in_processes(
     missing: Callable[[], Sequence[Run]], store: Store, setup: Setup
 ) -> None:
-    """Train runs in `setup.processes` processes of one core each; see `train_missing`.
-
-    The runs that are not stored, the most important first, are asked for again after
-    each program, because the result of a search decides which are needed.
-
-    Raises:
-      InputError: if there are more processes than cores, as `train_missing`, or if the
-        training of a program failed; the others are trained first.
-      Interrupted: if a signal was received; the processes have saved and ended.
-    """
+    """Train runs as `train_missing` in processes, and ask again for what is missing."""
     cores = sorted(os.sched_getaffinity(0))
     if setup.processes > len(cores):
         raise InputError(

@@ -71,24 +71,14 @@ def _ranges(numbers: Sequence[int]) -> str:
 
 
 def steps_until_solved(record: Record, success: float) -> float:
-    """Return the steps after which a run's mean return is half of a success's.
-
-    They are infinite for a run that does not solve its task: whose final return is less
-    than half of a success's, whatever it was before.
-    """
+    """Return the steps until half of a success's return; infinite if it ends below."""
     if not record.final >= success / 2:
         return math.inf
     return float(record.env_steps[(record.episode_return >= success / 2).argmax()])
 
 
 class Row(NamedTuple):
-    """A line of a forest plot.
-
-    Attributes:
-      name: what is compared.
-      compared: the comparison; its null is 0.
-      verdicts: the verdict on each single panel, where there are several.
-    """
+    """A line of a forest plot: what is compared, and the verdicts on single panels."""
 
     name: str
     compared: Comparison
@@ -194,11 +184,7 @@ class Results:
         return float(interquartile_mean(self.scores[panel, label])) < floor.mean
 
     def scale(self, env: str) -> tuple[float, float]:
-        """Return the returns on a task that count as 0 and as 1.
-
-        They are what its curves return at the start of training, and what the best of
-        them returns at the end.
-        """
+        """Return the returns that count as 0, at the start, and as 1, of the best."""
         own = [x for x in self.curves.values() if x.complete and x.curve.env == env]
         first = np.array([y.first for x in own for y in x.records.values()])
         start = float(interquartile_mean(first[np.isfinite(first)]))
@@ -293,13 +279,20 @@ class Results:
             for pair, one in every.items()
         ]
 
-    def ahead(self, kind: str = "") -> dict[str, Comparison]:
-        """Return how likely a seed of the favourite returns more than another curve's.
+    def measure(self, sooner: bool = False) -> tuple[str, float]:
+        """Return what `forest` measures in words, and the value of no difference."""
+        if self.is_of_one_task:
+            return "difference of final returns", 0.0
+        if self.sooner and not sooner:
+            return "difference of shares that solve a task", 0.0
+        return (
+            f"probability that the first {'is sooner' if sooner else 'returns more'}",
+            0.5,
+        )
 
-        The result is by the other curve. On sparse tasks it is how likely the favourite
-        is sooner.
-        """
-        rows = self.forest(kind, sooner=self.figure.solved_from is not None)
+    def ahead(self, kind: str = "") -> dict[str, Comparison]:
+        """Return how likely the favourite returns more, or is sooner, by curve."""
+        rows = self.forest(kind, sooner=bool(self.sooner))
         by_name, ours = {x.name: x.compared for x in rows}, self.figure.favourite
         others = {x: row_name("", ours, x) for x in self.figure.names()}
         return {x: by_name[name] for x, name in others.items() if name in by_name}

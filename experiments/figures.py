@@ -205,10 +205,7 @@ _TIME_ENDED = {("halfcheetah-delayed", "ppo"): 22}
 def _paper_panel(
     env: str, delay: int, normalize: bool, *, agents: Sequence[str]
 ) -> Panels:
-    """Return agents on a task under the paper's protocol, each with its search there.
-
-    Where outcomes are bimodal, the agents whose comparison decides have more seeds.
-    """
+    """Return agents under the paper's protocol; those that decide have more seeds."""
     bimodal = delay > 1 and env in _BIMODAL
     panel = name_of(env, delay) if normalize else f"{name_of(env, delay)} (raw)"
     return joined(

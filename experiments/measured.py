@@ -33,11 +33,7 @@ def machine() -> str:
 
 
 def find(command: str, options: Any) -> re.Match[str]:
-    """Return the part of the page that a command with these options writes.
-
-    Raises:
-      InputError: if the page does not have the command.
-    """
+    """Return the part of the page that a command with these options writes."""
     for part in _TABLE.finditer(PAGE.read_text()):
         words = [*shlex.split(part[2]), "--page"]
         if command == part[1] and read(type(options), words, "") == options:

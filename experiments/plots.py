@@ -29,10 +29,7 @@ MOST_LINES, _MOST_COLUMNS = 5, 4
 
 
 def curves(results: Results, kind: str = "") -> Picture:
-    """Return learning curves, or final returns over a setting, of a kind of panels.
-
-    Beside several tasks stands the mean over them.
-    """
+    """Return learning curves, or returns over a setting, and the mean over tasks."""
     figure = results.figure
     panels = [x for x in figure.of_kind(kind) if any(k[0] == x for k in results.curves)]
     lines, whole = _lines(figure), results.whole(kind) if len(panels) > 2 else {}
@@ -188,7 +185,7 @@ def _draw_whole(
         axes.plot([low, high], [row, row], color=color, linewidth=width)
         axes.plot(middle, row, "o", color=color, markersize=4)
     axes.tick_params(axis="x", labelsize=7)
-    unit = "share of seeds" if figure.solved_from else "score"
+    unit = "share of seeds" if figure.solved_from else "score, 1: the best agent's"
     axes.set_xlabel(unit, fontsize=8)
 
 
@@ -233,9 +230,8 @@ def forest(results: Results, kind: str = "") -> Picture:
     Small ticks are the smallest differences that would have been found. Squares are
     the verdicts on single tasks.
     """
-    parts = [results.forest(kind)]
-    if results.sooner:
-        parts.append(results.forest(kind, sooner=True))
+    kinds = [False, True] if results.sooner else [False]
+    parts = [results.forest(kind, sooner) for sooner in kinds]
     rows = parts[0]
     panels = list(dict.fromkeys(x for row in rows for x in row.verdicts))
     label = 0.075 * max((len(row.name) for row in rows), default=1)
@@ -248,14 +244,7 @@ def forest(results: Results, kind: str = "") -> Picture:
     picture = Picture(figsize=(width, height), layout="constrained")
     (grid,) = picture.subplots(1, len(ratios), width_ratios=ratios, squeeze=False)
     for i, part in enumerate(parts):
-        null, text = 0.5, "probability that the first returns more"
-        if results.is_of_one_task:
-            null, text = 0.0, "difference of final returns"
-        elif results.sooner:
-            null, text = (
-                (0.0, "difference of shares that solve a task"),
-                (0.5, "probability that the first is sooner"),
-            )[i]
+        text, null = results.measure(kinds[i])
         _draw_rows(grid[i], [row.compared for row in part], null, range(len(part)))
         grid[i].set_ylim(max(len(part), 2) - 0.5, -0.5)
         grid[i].set_xlabel(text, fontsize=8)

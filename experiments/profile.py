@@ -105,14 +105,7 @@ def operations(program: str) -> dict[str, str]:
 
 
 def seconds_of_parts(planes: Sequence[Any], program: str) -> dict[str, float]:
-    """Return the seconds that each part of a program takes in a trace of it.
-
-    On a GPU they are the times of its kernels, which run one after the other.
-
-    Args:
-      planes: the planes of a `jax.profiler.ProfileData`.
-      program: the text of the compiled program.
-    """
+    """Return the seconds of each part of a compiled program, in a trace of it."""
 
     # A GPU kernel has the name of its operation, with _ instead of punctuation.
     def plain(name: str) -> str:

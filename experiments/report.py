@@ -54,11 +54,7 @@ def fill_blocks(text: str, value: Callable[..., str]) -> str:
 
 
 def value(pages: Pages, name: str, *arguments: str) -> str:
-    """Return the text of a slot.
-
-    Raises:
-      InputError: if there is no such slot.
-    """
+    """Return the text of a slot."""
     if name == "claims":
         return claims.table(pages)
     if name == "readme":

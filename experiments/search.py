@@ -173,11 +173,7 @@ class Search:
     def scores(
         self, points: Iterable[Point], store: Store, seeds: Iterable[int] = SEEDS
     ) -> np.ndarray | None:
-        """Return the mean return over the last fifth of training, (points, seeds).
-
-        The result is None if the store lacks a run. A seed that ended no episode in
-        that time has -inf.
-        """
+        """Return returns of the last fifth, (points, seeds), or None if runs lack."""
         points, seeds = tuple(points), tuple(seeds)
         # The curves of all pages ask again and again.
         asked = (self, tuple(tuple(x.items()) for x in points), seeds)
@@ -325,10 +321,7 @@ class PaperSearch(SingleStage):
 
 
 class SecondStage(PaperSearch):
-    """`PaperSearch`, whose best points by two seeds get ten before one is chosen.
-
-    The ten seeds are other ones than the search's.
-    """
+    """`PaperSearch`, whose best points by two seeds get ten others for the choice."""
 
     _final_seeds = range(10)
 
@@ -415,11 +408,7 @@ CELLS = tuple((env, delay) for delay in (DELAY, 1) for env in TASKS)
 
 
 def searches(env: str, reward_delay: int) -> dict[str, Search]:
-    """Return the searches on a task by the names of their curves.
-
-    They are those of all agents and, if rewards are delayed, of PPO on decomposed
-    rewards: the control that shows what `ppo+gasil-adaptive` gains without imitation.
-    """
+    """Return the searches on a task, also of PPO on decomposed rewards."""
     by_name = {agent: Search(env, agent, reward_delay) for agent in AGENTS}
     if reward_delay > 1:
         decomposed = Search(env, "ppo", reward_delay, decompose_rewards=True)
@@ -432,11 +421,7 @@ class SingleSetting(Search):
     """The search of one agent for one point for all tasks, at one reward delay."""
 
     def chosen(self, store: Store) -> Point | None:
-        """Return the drawn point with the best mean rank, or None if runs are missing.
-
-        Points are ranked within each task, because returns of tasks have different
-        units.
-        """
+        """Return the drawn point with the best mean rank, or None if runs lack."""
         ranks, drawn = [], draw(self.agent)
         for env in TASKS:
             scores = dataclasses.replace(self, env=env).scores(drawn, store)

@@ -190,11 +190,7 @@ def write(path: pathlib.Path, records: Mapping[Run, Record]) -> None:
 
 
 def read(path: pathlib.Path) -> dict[Run, Record]:
-    """Return the runs of a file.
-
-    Raises:
-      InputError: if it is damaged, or has settings that the package does not have.
-    """
+    """Return the runs of a file, or raise `InputError` if it can't be read."""
     records = {}
     try:
         arrays = npz.read(path)
@@ -252,11 +248,7 @@ class Store:
         return [run for run in dict.fromkeys(runs) if run not in self]
 
     def add(self, records: Mapping[Run, Record]) -> int:
-        """Add the runs that are not stored yet, and return their number.
-
-        Several processes may add runs at once: the folder is locked while a file is
-        read and written.
-        """
+        """Add the runs that are not stored yet, and return their number."""
         added = 0
         self.answers.clear()
         self.folder.mkdir(parents=True, exist_ok=True)

@@ -126,9 +126,8 @@ def numbers(results: Results, kind: str = "") -> str:
     stored = sum(len(x.records) for key, x in results.curves.items() if key[0] in asked)
     lacking = f"Not trained yet: {total - stored} of {total} runs." * (stored < total)
     parts = [lacking, markdown_table(head, rows)]
-    parts.append(_compared(results.forest(kind), results))
-    if results.sooner:
-        parts.append(_compared(results.forest(kind, True), results, sooner=True))
+    for sooner in (False, True) if results.sooner else (False,):
+        parts.append(_compared(results.forest(kind, sooner), results, sooner))
     return folded("Numbers", *parts)
 
 
@@ -147,14 +146,10 @@ def _cell(results: Results, panel: str, name: str) -> str:
     return f"{len(solved) / len(until):.2f}{median}"
 
 
-def _compared(rows: Sequence[Row], results: Results, *, sooner: bool = False) -> str:
+def _compared(rows: Sequence[Row], results: Results, sooner: bool) -> str:
     """Return the rows of a forest plot as a table."""
-    null, spec, what = 0.5, ".2f", "is sooner" if sooner else "is more"
-    what = f"probability that the first {what}"
-    if results.is_of_one_task:
-        null, spec, what = 0.0, "", "difference"
-    elif results.sooner and not sooner:
-        null, what = 0.0, "difference of shares"
+    what, null = results.measure(sooner)
+    spec = "" if results.is_of_one_task else ".2f"
     lines = []
     for row in rows:
         one = row.compared
@@ -209,16 +204,13 @@ def count(results: Results, verdict: str, kind: str, ours: str, *others: str) ->
 def likely(
     results: Results, ours: str, other: str, kind: str = "", asked: str = ""
 ) -> str:
-    """Return how likely a seed of ours returns more than one of the other curve.
-
-    It is the row of the forest plot, and its verdict; empty without the curves' runs.
-    """
+    """Return a row of the forest plot in words, and its verdict."""
     if not any(key[1:] == (ours, other) for key in results.figure.compared()):
         raise InputError(f"likely has {ours}, {other}: not compared")
     compared = {row.name: row.compared for row in results.forest(kind)}
     if (one := compared.get(row_name("", ours, other))) is None:
         return ""
-    null = 0.0 if results.sooner else 0.5
+    _, null = results.measure()
     reached = _reached(null + one.middle, asked)
     return f"{_beside(null, one, '.2f')}, {one.verdict}{reached}"
 
@@ -255,10 +247,7 @@ def tasks(results: Results, verdict: str, kind: str, ours: str, other: str) -> s
 
 
 def foretold(results: Results, *words: str) -> str:
-    """Return whether predicted verdicts came true, or that they are not measured.
-
-    The words are panel, curve, other curve and the predicted verdict, again and again.
-    """
+    """Return whether verdicts, after panel and both curves, came true."""
     true = []
     for panel, ours, other, verdict in zip(*[iter(words)] * 4, strict=True):
         if (panel, ours, other) not in results.figure.compared():
@@ -270,10 +259,7 @@ def foretold(results: Results, *words: str) -> str:
 
 
 def passing(results: Results, threshold: str, *panels: str) -> str:
-    """Return which share of each curve's seeds returns more than a threshold.
-
-    Where some seeds learn a task and others don't, this says more than a mean.
-    """
+    """Return which share of each curve's seeds returns more than a threshold."""
     rows = []
     for name in results.figure.names(panels):
         finals = [results.scores.get((panel, name)) for panel in panels]
@@ -317,10 +303,7 @@ def grids(results: Results) -> str:
 
 
 def share(results: Results, kind: str, name: str, asked: str = "") -> str:
-    """Return the mean share of seeds that solve the tasks of a kind, as a percentage.
-
-    It is empty if the curve is not complete on all.
-    """
+    """Return the mean share of seeds that solve tasks of a kind, as a percentage."""
     panels = results.figure.of_kind(kind)
     if not panels:
         raise InputError(f"share has {kind}: no panels")
@@ -331,11 +314,7 @@ def share(results: Results, kind: str, name: str, asked: str = "") -> str:
 
 
 def rule(results: Results, name: str, kind: str) -> str:
-    """Return a table of a curve's settings on the tasks of a kind.
-
-    A row has the tasks that share their settings, of those that are not the defaults.
-    The last one has the agent's own, which are the same on all tasks.
-    """
+    """Return a table of a curve's settings beside the defaults, and of its agent's."""
     rows: dict[str, list[str]] = {}
     for panel in results.figure.of_kind(kind):
         algorithm = _find(results, panel, name).runs(results.searched)[0].algorithm

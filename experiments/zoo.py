@@ -37,20 +37,7 @@ class Options:
 
 
 def add(folder: pathlib.Path, episodes: int, zoo: pathlib.Path) -> str:
-    """Score the best policy of a run, and keep it if it is the best on its task.
-
-    Args:
-      folder: folder of the run.
-      episodes: number of episodes of the score.
-      zoo: folder of the package's policies.
-
-    Returns:
-      A line of text with the score and what was done.
-
-    Raises:
-      InputError: if it is not the folder of a finished run on a locomotion task, or
-        none of its seeds has a return.
-    """
+    """Score a run's best policy; if it is the best on its task, keep it in `zoo`."""
     trained = sweep.read(folder)
     algorithm, delay = trained.algorithm, trained.settings.reward_delay
     with input_checked():

@@ -20,13 +20,7 @@ from gasil_jax.ppo import ActorCritic
 
 
 class AdaptiveCloningState(struct.PyTreeNode):
-    """The agent's state.
-
-    Attributes:
-      buffer: the good-trajectory buffer.
-      policy_return: float32 (), moving mean of the returns of the policy's episodes.
-      has_episodes: bool (), whether an episode has been counted.
-    """
+    """The buffer, and a moving mean of the returns of the policy's episodes."""
 
     buffer: GoodTrajectories
     policy_return: jax.Array

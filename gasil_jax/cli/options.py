@@ -5,7 +5,7 @@ import dataclasses
 import importlib
 import pathlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from gasil_jax import algorithms, presets
@@ -22,6 +22,7 @@ from gasil_jax.host import (
     environments,
     folders,
     points,
+    start,
     sweep,
 )
 from gasil_jax.host.environments import Settings
@@ -55,7 +56,8 @@ class Options:
       agent: the agent: ppo, ppo+bc, ppo+sil, gasil, ppo+gasil, ppo+gasil-adaptive,
         ppo+novelty, ppo+bc+novelty, ppo+gasil+novelty, gail, or your own as
         MODULE:CLASS. Each has its own settings: this help shows those of the one that
-        is named beside it.
+        is named beside it. Several, separated by commas, are trained side by side, each
+        from its own preset: the points of a sweep.
       preset: the settings to start from: tuned, searched for each environment and
         agent; scaled, one rule for all tasks; gymnax, one setting for
         discrete actions; or paper, the paper's own protocol, with one environment per
@@ -70,6 +72,8 @@ class Options:
         log may differ. If the folder holds nothing yet, training begins.
       config: the config.json of another run: what it holds is used for all options that
         are not given.
+      init_from: folder of a run, whose best seed's policy, values and normalizer of
+        observations training starts from, instead of new ones.
       devices: number of CPU devices that share the seeds; default one for each core.
         All visible GPUs are used in any case.
       decompose_rewards: whether PPO learns from a reward for each step, which a network
@@ -90,6 +94,7 @@ class Options:
     out: pathlib.Path | None = None
     resume: bool = False
     config: pathlib.Path | None = None
+    init_from: pathlib.Path | None = None
     devices: int | None = None
     rewards: tuple[str, ...] = ()
     decompose_rewards: bool = False
@@ -104,6 +109,8 @@ class SweepOptions(Options):
       grid: NAME=VALUE,VALUE,... for each hyperparameter or count that varies.
       random: number of points to draw from the grid or, without a grid, from the
         ranges of the paper's appendix. The draw's seed is first_seed.
+      points_file: a JSON file with a list of points, {"NAME": VALUE, ...} each,
+        instead of grid and random.
       shard: train only this part of all points and seeds, NUMBER/COUNT with numbers
         from 1 on. Other processes train the others in the same folder. With --resume it
         continues.
@@ -113,6 +120,7 @@ class SweepOptions(Options):
 
     grid: tuple[str, ...] = ()
     random: int | None = None
+    points_file: pathlib.Path | None = None
     shard: str | None = None
     launcher: Literal["ray"] | None = None
     shards: int | None = None
@@ -147,29 +155,45 @@ def read(
         if not first.config.is_file():
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
-    algorithm, default = _defaults(kind, first, stored, origin)
+    known: dict[str, Any] = {"env": dataclasses.MISSING, "preset": first.preset}
+    if stored is None:
+        agents = (first.agent or Options.agent).split(",")
+        for name in agents:
+            if agents.count(name) > 1:
+                raise InputError(f"agent has {name!r} twice: name it once")
+        with input_checked():
+            every = [_default(name, first) for name in agents]
+    else:
+        _refuse_others(first, stored, origin)
+        every, seeds = [*stored.algorithms], stored.seeds
+        known = {"env": stored.env, "preset": stored.preset, "seeds": len(seeds)}
+        known["first_seed"] = seeds[0]
+    known["agent"] = ",".join(x.agent.name for x in every)
+    known["preset"] = known["preset"] or presets.DEFAULT
+    known["rewards"] = tuple(x.name for x in every[0].own_models)
+    known |= _switches(every[0])
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
-    parser.add_fields(kind, "run", default)
+    parser.add_fields(kind, "run", kind(**known))
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
-    _add_algorithm(parser, algorithm)
-    values = parser.read(words, _why_not(algorithm))
+    _add_algorithms(parser, every)
+    values = parser.read(words, every[0].why_not)
     options = kind(**parser.fields(values, "run"))
     given = {name: getattr(values, name) for name in parser.given(words)}
-    # A model of rewards that is off has options too.
-    switches = {x: given[x] for x in _switches(algorithm) if x in given}
     with input_checked():
-        algorithm = algorithm.replace(**switches)
-        own = {x: value for x, value in given.items() if x in algorithm.settings}
-        algorithm = algorithm.replace(**own)
+        algorithm, *others = (_changed(each, given) for each in every)
     requested = Sweep(
         options.env,
         algorithm,
         _seeds(options, stored),
+        others=tuple(others),
         settings=Settings(**parser.fields(values, "environment")),
         recording=Recording(**parser.fields(values, "recording")),
         preset=options.preset if stored is None else stored.preset,
+        start=None if stored is None else stored.start,
     )
+    if options.init_from is not None:
+        requested = dataclasses.replace(requested, start=start.find(options.init_from))
     _check(options, requested)
     if "evaluate_episodes" in given and requested.recording.evaluate_every is None:
         raise InputError(
@@ -182,8 +206,18 @@ def read(
     return options, requested
 
 
-def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
-    """Add an option for each setting."""
+def _changed(algorithm: Algorithm, given: Mapping[str, Any]) -> Algorithm:
+    """Return an algorithm with those of the given values that it has."""
+    # A model of rewards that is off has options too.
+    switches = {x: given[x] for x in _switches(algorithm) if x in given}
+    algorithm = algorithm.replace(**switches)
+    own = {x: value for x, value in given.items() if x in algorithm.settings}
+    return algorithm.replace(**own)
+
+
+def _add_algorithms(parser: Parser, every: Sequence[Algorithm]) -> None:
+    """Add an option for each setting; those of several agents have one."""
+    algorithm, *others = every
     agent, own = algorithm.agent, {type(model): model for model in algorithm.rewards}
     parser.add_fields(Config, "training", algorithm.config)
     parser.add_fields(type(agent), "agent", agent, all_shown=":" in agent.name)
@@ -191,6 +225,10 @@ def _add_algorithm(parser: Parser, algorithm: Algorithm) -> None:
         parser.add_fields(model, model.switch, own.get(model, model()))
     for each in algorithm.own_models:
         parser.add_fields(type(each), each.name, each, all_shown=True)
+    shared = {*names(agent)}
+    for other in (x.agent for x in others):
+        parser.add_fields(type(other), other.name, other, shared=shared)
+        shared |= {*names(other)}
 
 
 def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namespace:
@@ -203,46 +241,24 @@ def _first_options(kind: type[Options], words: Sequence[str]) -> argparse.Namesp
     return parser.parse_known_args(words)[0]
 
 
-def _defaults(
-    kind: type[Options], first: argparse.Namespace, stored: Sweep | None, origin: str
-) -> tuple[Algorithm, Options]:
-    """Return the algorithm and the options that hold where none are given."""
-    if stored is not None:
-        own_models = tuple(x.name for x in stored.algorithm.own_models)
-        for name, given, own in (
-            ("agent", first.agent, stored.algorithm.agent.name),
-            ("preset", first.preset, stored.preset),
-            ("rewards", first.rewards, own_models),
-        ):
-            if given not in (None, own):
-                raise InputError(
-                    f"{origin}, where {name} was {own}, is {given}: leave it "
-                    "out or name another one"
-                )
-        return stored.algorithm, kind(
-            env=stored.env,
-            agent=stored.algorithm.agent.name,
-            preset=stored.preset or presets.DEFAULT,
-            seeds=len(stored.seeds),
-            first_seed=stored.seeds[0],
-            rewards=own_models,
-            **_switches(stored.algorithm),
-        )
-    with input_checked():
-        algorithm = _default(first)
-    missing: Any = dataclasses.MISSING
-    return algorithm, kind(
-        env=missing,
-        agent=algorithm.agent.name,
-        preset=first.preset or presets.DEFAULT,
-        **_switches(algorithm),
-    )
+def _refuse_others(first: argparse.Namespace, stored: Sweep, origin: str) -> None:
+    """Raise `InputError` if a command line names another agent than a folder has."""
+    own_models = tuple(x.name for x in stored.algorithm.own_models)
+    for name, given, own in (
+        ("agent", first.agent, stored.agent),
+        ("preset", first.preset, stored.preset),
+        ("rewards", first.rewards, own_models),
+    ):
+        if given not in (None, own):
+            raise InputError(
+                f"{origin}, where {name} was {own}, is {given}: leave it out or name "
+                "another one"
+            )
 
 
-def _default(first: argparse.Namespace) -> Algorithm:
+def _default(name: str, first: argparse.Namespace) -> Algorithm:
     """Return the algorithm from which an agent starts."""
-    agent = descriptions.find_agent(first.agent or Options.agent)
-    preset = first.preset or presets.DEFAULT
+    agent, preset = descriptions.find_agent(name), first.preset or presets.DEFAULT
     algorithm = Algorithm(agent())
     if first.env is not None:
         algorithm = presets.preset(
@@ -255,14 +271,6 @@ def _default(first: argparse.Namespace) -> Algorithm:
     models = tuple(descriptions.find_model(each)() for each in first.rewards or ())
     algorithm = dataclasses.replace(algorithm, rewards=(*models, *algorithm.rewards))
     algorithms.check(algorithm)
-    taken = {*names(SweepOptions), *names(Settings)}
-    parts: tuple[Any, ...] = (algorithm.agent, *models)
-    for part in parts:
-        for setting in taken.intersection(names(part)):
-            raise InputError(
-                f"{part.name!r} has a setting {setting!r}, a name that is taken by an "
-                "option: it must be a new one"
-            )
     return algorithm
 
 
@@ -281,14 +289,6 @@ def _action_size(env: str, agent: str, preset: str) -> int | None:
     if environments.is_discrete(built):
         return presets.DISCRETE_SIZE
     return int(built.action_size)
-
-
-def _why_not(algorithm: Algorithm) -> Callable[[str], str | None]:
-    def why_not(name: str) -> str | None:
-        why = algorithm.why_not(name)
-        return why if " is a setting of " in why else None
-
-    return why_not
 
 
 def _seeds(options: Options, stored: Sweep | None) -> Sequence[int]:
@@ -310,22 +310,30 @@ def _with_points(options: Options, requested: Sweep, stored: Sweep | None) -> Sw
     """Return the sweep with the points that the options name."""
     named: Sequence[points.Point] | None = None
     if isinstance(options, SweepOptions):
-        if options.grid or options.random is not None:
+        if options.points_file is not None:
+            if options.grid or options.random is not None:
+                raise InputError("points_file can't be combined with grid or random")
+            named = points.read(options.points_file)
+        elif options.grid or options.random is not None:
             named = points.make_points(
                 options.grid,
                 options.random,
                 seed=options.first_seed,
-                algorithm=requested.algorithm,
+                algorithms=requested.algorithms,
             )
-        elif stored is None:
+        elif stored is None and not requested.others:
             raise InputError(
-                "grid is empty: it must be NAME=VALUE,..., or use --random"
+                "grid is empty: it must be NAME=VALUE,..., or use --random, "
+                "--points-file or several agents"
             )
     if named is None and stored is not None:
         return dataclasses.replace(requested, points=stored.points)
     named = named or [{}]
-    points.check(named, requested.algorithm)
-    every = points.completed(named, requested.algorithm)
+    if requested.others:
+        agents = [each.agent.name for each in requested.algorithms]
+        named = [{"agent": agent, **point} for agent in agents for point in named]
+    points.check(named, *requested.algorithms)
+    every = points.completed(named, *requested.algorithms)
     return dataclasses.replace(requested, points=every)
 
 
@@ -337,7 +345,8 @@ def _check(options: Options, requested: Sweep) -> None:
     with input_checked():
         environments.check(options.env, requested.settings)
         presets.check(options.preset)
-        algorithms.check(requested.algorithm)
+        for each in requested.algorithms:
+            algorithms.check(each)
         validate(requested.recording)
     check_minimum(options, devices=1)
     check_minimum(requested.settings, max_episode_steps=1)
@@ -363,19 +372,20 @@ def _note_without_effect(given: Mapping[str, Any], requested: Sweep) -> None:
 
 def note_if_untuned(options: Options, requested: Sweep, env: Any) -> None:
     """Print a note if the default preset has nothing for the agent and the task."""
-    lacking = presets.describe_lack(
-        options.env,
-        requested.algorithm.agent.name,
-        presets.DEFAULT,
-        reward_delay=requested.settings.reward_delay,
-    )
     default = options.preset == presets.DEFAULT
     default &= not options.resume and options.config is None
-    if default and lacking is not None:
+    for each in requested.algorithms if default else ():
+        lacking = presets.describe_lack(
+            options.env,
+            each.agent.name,
+            presets.DEFAULT,
+            reward_delay=requested.settings.reward_delay,
+        )
         more = ""
         if environments.is_discrete(env):
             more = " (--preset gymnax has one setting for discrete actions)"
-        note(f"{lacking}: options that are not given have their defaults{more}")
+        if lacking is not None:
+            note(f"{lacking}: options that are not given have their defaults{more}")
 
 
 def make_folder(options: Options) -> pathlib.Path:

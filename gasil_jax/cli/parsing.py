@@ -62,9 +62,18 @@ class Parser(argparse.ArgumentParser):
         raise InputError(message.replace("\n", " "))
 
     def add_fields(
-        self, kind: Any, title: str, default: Any = None, *, all_shown: bool = False
+        self,
+        kind: Any,
+        title: str,
+        default: Any = None,
+        *,
+        all_shown: bool = False,
+        shared: Collection[str] = (),
     ) -> None:
-        """Add an option for each field of a dataclass, as a group of the help."""
+        """Add an option for each field of a dataclass, as a group of the help.
+
+        Those that are `shared` with others have an option already.
+        """
         group = self.add_argument_group(title)
         texts, hints = _texts(kind), get_type_hints(kind)
         own = self._of[title] = []
@@ -72,8 +81,13 @@ class Parser(argparse.ArgumentParser):
             value = _default(field) if default is None else getattr(default, field.name)
             text = texts.get(field.name, "").replace("%", "%%")
             shown = all_shown or self._shown is None or field.name in self._shown
-            if field.name in self._names:  # Two agents may share a setting.
+            if field.name in shared:
                 continue
+            if field.name in self._names:
+                raise InputError(
+                    f"{title} has a setting {field.name!r}, a name that is taken by an "
+                    "option: it must be a new one"
+                )
             own.append(field.name)
             if field.metadata.get("positional"):
                 of_type = _of_type(hints[field.name]) | {"metavar": field.name.upper()}
@@ -96,7 +110,7 @@ class Parser(argparse.ArgumentParser):
     def read(
         self,
         given: Sequence[str],
-        why_not: Callable[[str], str | None] = lambda name: None,
+        why_not: Callable[[str], str] = lambda name: "",
     ) -> argparse.Namespace:
         """Return the values of the words of a command line."""
         if "--version" in given:
@@ -113,7 +127,8 @@ class Parser(argparse.ArgumentParser):
             name = flag.removeprefix("--").replace("-", "_")
             if not flag.startswith("--"):
                 raise InputError(f"{word!r} is not an option or its value: see --help")
-            if (why := why_not(name.removeprefix("no_"))) is not None:
+            # Of another agent.
+            if " is a setting of " in (why := why_not(name.removeprefix("no_"))):
                 raise InputError(f"option {flag} is unknown: {why}")
             near = nearest(name.removeprefix("no_"), self._names)
             meant = f"did you mean --{near.replace('_', '-')}?" if near else ""
@@ -190,7 +205,9 @@ def _of_type(hint: Any) -> dict[str, Any]:
             one["type"] = _number(whole_number, "whole numbers, separated by spaces")
         return {**one, "nargs": "*", "action": _Once}
     if get_origin(hint) is typing.Literal:
-        return {"choices": get_args(hint), "metavar": "|".join(get_args(hint))}
+        names = {name: name for name in get_args(hint)}
+        named = _number(names.__getitem__, f"one of {', '.join(names)}")
+        return {"type": named, "metavar": "|".join(names)}
     if hint is bool:
         return {"action": argparse.BooleanOptionalAction}
     if hint is int:
@@ -204,7 +221,7 @@ def _of_type(hint: Any) -> dict[str, Any]:
 
 def _number(kind: Callable[[str], Any], what: str) -> Callable[[str], Any]:
     def number(text: str) -> Any:
-        with contextlib.suppress(ValueError, OverflowError):
+        with contextlib.suppress(LookupError, ValueError, OverflowError):
             return kind(text)
         raise argparse.ArgumentTypeError(f"is {text!r}: it must be {what}")
 

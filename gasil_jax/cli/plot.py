@@ -12,7 +12,7 @@ from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import output_file, plotting, saved, tables
+from gasil_jax.host import output_file, plotting, results, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -24,7 +24,8 @@ class Options:
     """Draw learning curves, final returns and performance profiles.
 
     Attributes:
-      runs: folders of runs and sweeps, each a curve of its own.
+      runs: folders of runs and sweeps, each a curve of its own, and a sweep over agents
+        one for each agent.
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
@@ -187,16 +188,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{len(options.runs)} runs"
         )
     output_file.check(options.out, (".png", ".pdf", ".svg"))
-    runs = [
-        read(folder, label, options.point, metric=options.metric)
-        for folder, label in zip(options.runs, labels, strict=True)
-    ]
+    runs, places = [], []
+    for folder, label in zip(options.runs, labels, strict=True):
+        best = {} if options.point is not None else results.best_points(folder)[1]
+        several = {x: y for x, y in best.items() if y is not None and len(best) > 1}
+        for agent, point in several.items() or [("", options.point)]:
+            own = f"{label}, {agent}" if label and agent else label
+            runs.append(read(folder, own, point, metric=options.metric))
+            places.append(folder)
     told = [run.label for run in runs]
     runs = [
         run._replace(label=f"{run.label} ({folder})")
         if told.count(run.label) > 1
         else run
-        for folder, run in zip(options.runs, runs, strict=True)
+        for folder, run in zip(places, runs, strict=True)
     ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:

@@ -14,7 +14,7 @@ from gasil_jax.cli.options import Options
 from gasil_jax.cli.parsing import input_checked
 from gasil_jax.cli.reporting import reports_errors
 from gasil_jax.errors import InputError
-from gasil_jax.host import environments, folders, results, saved, training
+from gasil_jax.host import environments, folders, results, saved, start, training
 from gasil_jax.host.driver import Outcome
 from gasil_jax.host.interruption import Interruption, noted
 from gasil_jax.host.output_file import WriteError, note
@@ -40,6 +40,7 @@ def train(
     needed = requested.unfinished(options.out or NOWHERE, runs)
     with input_checked():
         env = training.prepare(requested, needed, num_devices=options.devices)
+        policy = requested.start and start.load(requested.start, env, needed)
     options_.note_if_untuned(options, requested, env)
     folder = options_.make_folder(options)
     # Another shard may have begun, or added points, since.
@@ -50,11 +51,13 @@ def train(
     try:
         with noted(how), Interruption() as interruption:
             needed = requested.unfinished(folder, runs)
+            if policy is not None:
+                start.begin(policy, env, needed)
             outcomes = training.train_programs(
                 env,
                 needed,
                 requested.recording,
-                title=f"{requested.env} {requested.algorithm.agent.name}",
+                title=f"{requested.env} {requested.agent}",
                 interruption=interruption,
             )
         trained = requested.trained(folder)

@@ -14,6 +14,7 @@ training continues from an older one.
 
 import contextlib
 import hashlib
+import json
 import math
 import os
 import pathlib
@@ -172,6 +173,11 @@ class Checkpoint(NamedTuple):
     def restore(self, like: Any) -> Any:
         """Return the saved state; see the function `restore`."""
         return restore(self.folder / _STATE, like)
+
+    def digest(self) -> str:
+        """Return a hash of its files."""
+        files = json.dumps(_manifest(self.folder)["files"], sort_keys=True)
+        return hashlib.sha256(files.encode()).hexdigest()
 
 
 class WriteError(output_file.WriteError):

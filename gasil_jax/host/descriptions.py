@@ -66,7 +66,10 @@ def _find(kind: str, name: Any, base: Any) -> Any:
 def describe(algorithm: Algorithm) -> dict[str, Any]:
     """Return the names of the agent and of one's own models, and every setting."""
     own = tuple(model.name for model in algorithm.own_models)
-    return {"agent": algorithm.agent.name, "rewards": own, **algorithm.settings}
+    values = {
+        x: "a function" if callable(y) else y for x, y in algorithm.settings.items()
+    }
+    return {"agent": algorithm.agent.name, "rewards": own, **values}
 
 
 def read(values: Mapping[str, Any]) -> Algorithm:
@@ -77,12 +80,7 @@ def read(values: Mapping[str, Any]) -> Algorithm:
     agent = find_agent(settings.pop("agent"))
     own = json_files.as_type(tuple[str, ...], settings.pop("rewards", ()), "rewards")
     algorithm = Algorithm(agent(), tuple(find_model(name)() for name in own))
-    switches = {
-        model.switch: json_files.as_type(
-            bool, settings.pop(model.switch, False), model.switch
-        )
-        for model in REWARD_MODELS
-    }
+    switches = {x.switch: settings.pop(x.switch, False) for x in REWARD_MODELS}
     algorithm = algorithm.replace(**switches)
     kinds: dict[str, Any] = {}
     for part in algorithm.parts:

@@ -1,7 +1,6 @@
 """Train the members of a program in chunks; log, save and evaluate them in between.
 
-`drive` writes metrics.csv, checkpoints/ and, if policies are evaluated during training,
-evaluations.csv. A checkpoint records the number of rows of the two tables. Training
+A checkpoint records the number of rows of metrics.csv and evaluations.csv. Training
 that continues from it cuts the tables to these rows and writes the later ones again.
 """
 
@@ -23,8 +22,7 @@ from gasil_jax.errors import InputError
 from gasil_jax.host import checkpoint
 from gasil_jax.host.evaluations import Evaluation
 from gasil_jax.host.interruption import Interrupted, Interruption
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members
+from gasil_jax.host.members import Interval, Members
 from gasil_jax.host.output_file import note
 from gasil_jax.host.programs import Training
 from gasil_jax.host.progress import Progress

@@ -1,9 +1,4 @@
-"""Evaluate the policies of all members at regular intervals during training.
-
-The scores go to evaluations.csv, beside metrics.csv: a row for each member and
-evaluation, with the mean, lowest and highest return of its episodes and their mean
-length. Evaluations do not change training, not by a single bit.
-"""
+"""Evaluate the policies of all members at regular intervals during training."""
 
 import time
 from collections.abc import Sequence
@@ -13,8 +8,7 @@ import jax
 import numpy as np
 
 from gasil_jax.evaluation import evaluate
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members
+from gasil_jax.host.members import Interval, Members
 from gasil_jax.host.tables import TableWriter
 from gasil_jax.host.trackers import Tracker
 from gasil_jax.train import TrainState
@@ -31,13 +25,7 @@ def evaluation_key(seed: jax.Array | int, iteration: jax.Array | int) -> jax.Arr
 
 
 class Evaluation:
-    """Evaluates all members with one compiled program, sharded as training is.
-
-    Attributes:
-      table: writes evaluations.csv.
-      interval: when to evaluate, beside the untrained and the final policy.
-      seconds: time of all evaluations in this process, including compilation.
-    """
+    """Evaluates all members with one compiled program, sharded as training is."""
 
     #: Columns of evaluations.csv after those that identify the members.
     COLUMNS = ("env_steps", "mean", "min", "max", "length")

@@ -221,8 +221,6 @@ def _describe(
         stored = json_files.to_json(descriptions.describe(algorithm))
         if descriptions.read(json.loads(stored)) != algorithm:
             why = why or "an agent or models of rewards that a command can't name"
-    except TypeError:
-        why = why or "a schedule that is a function"
     except ValueError as error:
         why = why or str(error)
     kind = type(getattr(env, "unwrapped", env)).__name__

@@ -12,11 +12,7 @@ ANSWER = "stopping soon; Ctrl-C again quits now"
 
 
 class Interrupted(Exception):
-    """Raised when a signal has stopped a run early; its progress is saved.
-
-    Attributes:
-      signal: the signal.
-    """
+    """Raised when a signal has stopped a run early; its progress is saved."""
 
     def __init__(self, number: signal.Signals):
         super().__init__(f"interrupted by {number.name}; all that was done is saved")
@@ -34,11 +30,7 @@ def noted(how_to_continue: str) -> Iterator[None]:
 
 
 class Interruption:
-    """Records the first signal in the `with` block; a second one ends the process.
-
-    Attributes:
-      signal: the signal that was received, or None.
-    """
+    """Records the first signal in the `with` block; a second one ends the process."""
 
     def __init__(self) -> None:
         self.signal: signal.Signals | None = None

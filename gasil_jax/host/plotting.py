@@ -250,17 +250,23 @@ def _draw_marginal(
     axes: Any, values: Sequence[Any], returns: np.ndarray, *, best: int | None
 ) -> None:
     """Draw the points' returns over one hyperparameter, and the mean of each value."""
-    places = np.array(values, float)
-    positive = places[places > 0.0]
-    # In floats 3e-4 / 3e-5 is less than 10.
-    if positive.size and positive.max() > 9.99 * positive.min():
-        # Values that are not positive lie on the linear part about 0.
-        linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
-        axes.set_xscale("symlog" if linear else "log", **linear)
-    if len(tried := np.unique(places)) <= _MOST_TICKS:
-        _mark_tried(axes, tried)
-    means = [returns[places == value].mean() for value in tried]
-    axes.plot(tried, means, "-D", color=COLORS[0], markersize=6, label="mean")
+    if not isinstance(values[0], str):
+        places, style = np.array(values, float), "-D"
+        positive = places[places > 0.0]
+        # In floats 3e-4 / 3e-5 is less than 10.
+        if positive.size and positive.max() > 9.99 * positive.min():
+            # Values that are not positive lie on the linear part about 0.
+            linear = {"linthresh": positive.min()} if places.min() <= 0.0 else {}
+            axes.set_xscale("symlog" if linear else "log", **linear)
+        if len(tried := np.unique(places)) <= _MOST_TICKS:
+            _mark_tried(axes, tried)
+    else:
+        names = list(dict.fromkeys(values))
+        places, style = np.array([names.index(x) for x in values]), "D"
+        axes.set_xticks(range(len(names)), [str(name) for name in names])
+    centres = np.unique(places)
+    means = [returns[places == centre].mean() for centre in centres]
+    axes.plot(centres, means, style, color=COLORS[0], markersize=6, label="mean")
     axes.plot(places, returns, "o", color="0.3", markersize=3, label="point")
     axes.margins(x=0.1)
     if best is not None:

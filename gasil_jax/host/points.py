@@ -1,7 +1,11 @@
-"""Make or draw the points of a sweep, each of changed settings by name."""
+"""Read, make or draw the points of a sweep.
+
+A point holds changed settings, by name; of a sweep over agents its "agent", too.
+"""
 
 import itertools
 import math
+import pathlib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -11,7 +15,8 @@ from gasil_jax.agents import agents_with
 from gasil_jax.algorithms import Algorithm
 from gasil_jax.algorithms import check as check_algorithm
 from gasil_jax.config import names, ranges
-from gasil_jax.errors import InputError, did_you_mean, refusal
+from gasil_jax.errors import InputError, did_you_mean, unknown
+from gasil_jax.host import json_files
 from gasil_jax.rewards import REWARD_MODELS
 
 Point = Mapping[str, Any]
@@ -49,29 +54,51 @@ def _kinds(algorithm: Algorithm) -> Mapping[str, type]:
 
 def in_words(point: Point) -> str:
     """Return the values of a point as text."""
-    return ", ".join(f"{name}={value:g}" for name, value in point.items())
+    return ", ".join(
+        str(value) if name == "agent" else f"{name}={value:g}"
+        for name, value in point.items()
+    )
 
 
-def completed(every: Iterable[Point], algorithm: Algorithm) -> tuple[Point, ...]:
+def algorithm_of(
+    point: Point, algorithms: Sequence[Algorithm]
+) -> tuple[Algorithm, dict[str, Any]]:
+    """Return a point's algorithm, by default the first, and the values it changes."""
+    values, known = dict(point), {x.agent.name: x for x in algorithms}
+    agent = values.pop("agent", algorithms[0].agent.name)
+    if agent not in known:
+        raise InputError(unknown("agent", agent, [*known]))
+    return known[agent], values
+
+
+def completed(every: Iterable[Point], *algorithms: Algorithm) -> tuple[Point, ...]:
     """Return points that all have the same names, without repetitions."""
     listed = list(every)
     varied = list(dict.fromkeys(name for point in listed for name in point))
-    kinds, own = _kinds(algorithm), algorithm.settings
-    whole = [{x: kinds[x](point.get(x, own[x])) for x in varied} for point in listed]
+    whole = []
+    for point in listed:
+        algorithm, _ = algorithm_of(point, algorithms)
+        # A point that lacks a name has its algorithm's own value.
+        values = {"agent": algorithm.agent.name, **algorithm.settings, **point}
+        kinds = {"agent": str, **_kinds(algorithm)}
+        whole.append({x: kinds[x](values[x]) for x in varied})
     return tuple(x for i, x in enumerate(whole) if x not in whole[:i])
 
 
-def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...]]:
+def _grid(
+    grid: Sequence[str], algorithms: Sequence[Algorithm]
+) -> dict[str, tuple[Any, ...]]:
     """Return the values by name from entries NAME=VALUE,VALUE,..."""
     values: dict[str, tuple[Any, ...]] = {}
-    kinds = _kinds(algorithm)
+    kinds = _kinds(algorithms[0])
     for entry in grid:
         name, _, listed = entry.partition("=")
         name = name.replace("-", "_")
         if name in values:
             raise InputError(f"grid has {name} twice: give all its values in one entry")
-        if name not in kinds:
-            raise InputError(f"grid: {_why_not(name, algorithm)}")
+        for algorithm in algorithms:
+            if name not in _kinds(algorithm):
+                raise InputError(f"grid: {_why_not(name, algorithm)}")
         number = whole_number if kinds[name] is int else float
         try:
             values[name] = tuple(dict.fromkeys(map(number, listed.split(","))))
@@ -88,16 +115,15 @@ def _grid(grid: Sequence[str], algorithm: Algorithm) -> dict[str, tuple[Any, ...
     return values
 
 
-def check(every: Iterable[Point], algorithm: Algorithm, *, source: str = "") -> None:
+def check(every: Iterable[Point], *algorithms: Algorithm, source: str = "") -> None:
     """Check that points change what can vary, to values that are allowed."""
-    allowed, unused = _kinds(algorithm), without_effect(algorithm)
     try:
-        for values in every:
-            for name, value in values.items():
+        for point in every:
+            algorithm, values = algorithm_of(point, algorithms)
+            allowed, unused = _kinds(algorithm), without_effect(algorithm)
+            for name in values:
                 if name not in allowed:
                     raise InputError(_why_not(name, algorithm))
-                if value is None:
-                    raise refusal(name, value, "a number")
                 if name in unused:
                     raise InputError(f"{name} can't vary: {unused[name]}")
             check_algorithm(algorithm.replace(**values))
@@ -116,6 +142,8 @@ def without_effect(algorithm: Algorithm) -> dict[str, str]:
 
 def _why_not(name: str, algorithm: Algorithm) -> str:
     """Return why a sweep of an algorithm can't vary a name, and what it can vary."""
+    if name == "agent":
+        return "'agent' can't vary here: name several agents as --agent A,B"
     allowed = tuple(_kinds(algorithm))
     of_models = {x for model in REWARD_MODELS for x in names(model)}
     if name not in algorithm.settings and (name in of_models or agents_with(name)):
@@ -123,19 +151,34 @@ def _why_not(name: str, algorithm: Algorithm) -> str:
     return f"{name!r} can't vary: {did_you_mean(name, allowed)}"
 
 
+def read(path: pathlib.Path) -> list[Point]:
+    """Return the points that a JSON file lists."""
+    try:
+        every: Sequence[Point] = json_files.read(
+            path, tuple[dict[str, float | str], ...]
+        )
+    except OSError as error:
+        raise InputError(
+            f"points_file is {path}, which can't be read: {error}"
+        ) from None
+    if not every:
+        raise InputError(f"points_file is {path}: it must list a point or more")
+    return list(every)
+
+
 def make_points(
     grid: Sequence[str],
     random: int | None,
     *,
     seed: int,
-    algorithm: Algorithm,
+    algorithms: Sequence[Algorithm],
 ) -> list[Point]:
-    """Return the points of a sweep."""
-    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithm)
+    """Return the points of a sweep, of all its agents."""
+    values: Mapping[str, tuple[Any, ...]] = _grid(grid, algorithms)
     if random is None:
         every = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in every]
-    known = _kinds(algorithm)
+    known = set.intersection(*({*_kinds(algorithm)} for algorithm in algorithms))
     values = values or {name: x for name, x in PAPER_RANGES.items() if name in known}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)

@@ -58,11 +58,8 @@ class Program:
     runs: tuple[Run, ...]  # the members
     path: pathlib.Path = NOWHERE  # its folder, which may not exist yet
     # The columns that identify the members in its tables, (members,) each: "seed" and
-    # others.
+    # others. Its folder may hold further members, of runs that nobody has asked for.
     labels: Mapping[str, Sequence[int]] = dataclasses.field(default_factory=dict)
-    # Number of further members that are stored in its folder, of runs that nobody has
-    # asked for.
-    others: int = 0
     indices: tuple[int, ...] = ()  # the place of each run among all members
 
     @property
@@ -83,7 +80,7 @@ class Program:
     @property
     def num_members(self) -> int:
         """The number of members, also of runs that nobody has asked for."""
-        return len(self.runs) + self.others
+        return len(self.labels["seed"])
 
     def below(
         self, parent: pathlib.Path, labels: Mapping[str, Sequence[int]]
@@ -99,7 +96,6 @@ class Program:
         return dataclasses.replace(
             self,
             runs=tuple(self.runs[i] for i in kept),
-            others=self.num_members - len(kept),
             indices=tuple(self.indices[i] for i in kept),
         )
 
@@ -204,8 +200,7 @@ def read(parent: pathlib.Path, requested: Collection[Run]) -> list[Program]:
         indices = tuple(i for i, x in enumerate(members) if x in known)
         if indices:
             runs = tuple(known[members[i]] for i in indices)
-            others = len(members) - len(runs)
-            program = Program(runs, path.parent, labels, others, indices)
+            program = Program(runs, path.parent, labels, indices)
             config, training = program.algorithm.config, program.training
             # It was copied here, and what learned for longer is another run.
             if every[0]["algorithm"]["total_steps"] > config.total_steps:
@@ -228,8 +223,7 @@ def labelled(parent: pathlib.Path, point: int) -> list[Program]:
         with json_files.blamed(path):
             indices = tuple(i for i, x in enumerate(labels["point"]) if x == point)
             if indices:
-                others = len(labels["seed"])
-                every.append(Program((), path.parent, labels, others, indices))
+                every.append(Program((), path.parent, labels, indices))
     return every
 
 
@@ -247,7 +241,8 @@ def unfinished(
     """Return the programs to continue, and the requested runs that no program holds."""
     finished = [x for x in stored if x.is_finished]
     # A program that is continued trains all of its runs, also those of others.
-    begun = [x for x in stored if x not in finished and not x.others]
+    whole = [x for x in stored if len(x.runs) == x.num_members]
+    begun = [x for x in whole if x not in finished]
     for each in stored:
         if each not in (*finished, *begun):
             _note_left(each.path)

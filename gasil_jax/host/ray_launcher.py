@@ -1,8 +1,4 @@
-"""Run a sweep's shards on a Ray cluster: ``python -m gasil_jax.sweep --launcher ray``.
-
-Each job is a process of its own. If that dies it is run again, and continues from its
-checkpoint.
-"""
+"""Run a sweep's shards on a Ray cluster, each as a process of its own."""
 
 import contextlib
 import importlib

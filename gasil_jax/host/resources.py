@@ -51,7 +51,7 @@ def _size(tree: Any) -> int:
 
 def need(env: Any, algorithm: Algorithm) -> int:
     """Estimate the bytes of memory that one run needs, within a factor of two."""
-    state = jax.eval_shape(lambda: train.init(env, algorithm, jax.random.key(0)))
+    state = jax.eval_shape(lambda: train.first_state(env, algorithm, jax.random.key(0)))
     # Numbers per step: the fields of a `Rollout` and those that PPO adds.
     numbers = 2 * env.observation_size + wrappers.action_size(env) + 12
     batches = _BATCHES_PER_PROGRAM * 4 * algorithm.config.batch_steps * numbers

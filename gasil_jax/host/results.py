@@ -125,13 +125,13 @@ def write(folder: pathlib.Path, results: Results) -> dict[str, Any]:
     best = told["best_by_mean"]
     shown = 0 if best is None else best
     scores = {x: y[shown] for x, y in results.evaluations.items()}
-    title = f"{sweep.env}, {sweep.algorithm.agent.name}"
+    title = ", ".join([sweep.env, *sweep.agent.split(",")])
     with output_file.atomic(folder / "learning_curve.png") as partial:
         plotting.learning_curve(
             partial,
             results.metrics["env_steps"][shown, 0],
             results.metrics["episode_return"][shown],
-            title=title,
+            title=f"{sweep.env}, {_agents(results)[shown]}",
             evaluations=scores or None,
         )
     if len(sweep.points) > 1:
@@ -196,7 +196,7 @@ def _summary(results: Results) -> dict[str, Any]:
 
     return {
         "env": sweep.env,
-        "agent": sweep.algorithm.agent.name,
+        "agent": sweep.agent,
         "env_steps_per_seed": int(np.nanmax(results.metrics["env_steps"])),
         "points": [
             {
@@ -216,9 +216,19 @@ def _summary(results: Results) -> dict[str, Any]:
             for i, point in enumerate(sweep.points)
         ],
         "best_by_mean": results.best(results.mean),
+        "best_of_agents": {
+            each: results.best(np.where(_agents(results) == each, results.mean, np.nan))
+            for each in sweep.agent.split(",")
+        },
         **_speed(trainings),
         "versions": _joined([x["versions"] for x in trainings]),
     }
+
+
+def _agents(results: Results) -> np.ndarray:
+    """Return the name of each point's agent."""
+    sweep = results.sweep
+    return np.array([str(x.get("agent", sweep.agent)) for x in sweep.points])
 
 
 def _speed(trainings: Sequence[Training]) -> dict[str, Any]:
@@ -279,12 +289,13 @@ class _Best(TypedDict, total=False):
     """What other commands read of summary.json."""
 
     best_by_mean: int | None
+    best_of_agents: dict[str, int | None]
 
 
-def best_point(folder: pathlib.Path) -> int | None:
-    """Return the point with the best mean, from summary.json; None if unknown."""
+def best_points(folder: pathlib.Path) -> tuple[int | None, dict[str, int | None]]:
+    """Return the best point by mean, of all and of each agent; None if unknown."""
     try:
         best: _Best = json_files.read(folder / "summary.json", _Best)
     except FileNotFoundError:
-        return None
-    return best.get("best_by_mean")
+        return None, {}
+    return best.get("best_by_mean"), best.get("best_of_agents", {})

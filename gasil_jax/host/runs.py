@@ -25,7 +25,8 @@ _WAYS = ("physics",)
 class Run:
     """The settings that decide the numbers of one training run.
 
-    The physics engine and the device are not among them, because they compute the same
+    `start` is the hash of the policy that it starts from, if that is a trained one. The
+    physics engine and the device are not among them, because they compute the same
     thing in different ways.
     """
 
@@ -34,6 +35,7 @@ class Run:
     seed: int
     settings: Settings = dataclasses.field(default_factory=Settings)
     algorithm_version: int = ALGORITHM_VERSION
+    start: str | None = None
 
     def __post_init__(self) -> None:
         same = {name: getattr(Settings, name) for name in _WAYS}
@@ -46,9 +48,7 @@ class Run:
         """The settings in the key by name, those of the algorithm in "algorithm"."""
         values = descriptions.describe(self.algorithm)
         for name, value in values.items():
-            if callable(value):
-                values[name] = "a function"
-            elif name.endswith("_schedule"):
+            if name.endswith("_schedule") and value != "a function":
                 values[name] = [[float(x) for x in point] for point in value]
         # 1 and 1.0 are the same number, and so the same run.
         for part in self.algorithm.parts:
@@ -60,6 +60,7 @@ class Run:
             settings[name] = float(settings[name])
         return {
             "env": self.env,
+            **({"start": self.start} if self.start else {}),
             **{name: x for name, x in settings.items() if name not in _WAYS},
             "algorithm_version": self.algorithm_version,
             "algorithm": values,

@@ -42,7 +42,7 @@ def find(folder: pathlib.Path, point: int | None) -> tuple[str, str, list[Progra
     """Return the environment's and the agent's name, and the programs of a point."""
     stored = sweep.described(folder)
     chosen = _choose_point(folder, stored["points"], point)
-    agent = stored["algorithm"].get("agent")
+    agent = stored["points"][chosen].get("agent", stored["algorithm"].get("agent"))
     if stored["only_python"] is None:
         every = programs_of(folder, sweep.made(folder, stored), chosen)
     else:
@@ -76,7 +76,7 @@ def _choose_point(
     """Return the number of the requested point; by default the best by mean."""
     last = len(points) - 1
     if point is None and last > 0:
-        if (point := results.best_point(folder)) is None:
+        if (point := results.best_points(folder)[0]) is None:
             raise InputError(
                 f"run is {folder}, a sweep without a best point: name one, --point 0 "
                 f"to {last}"

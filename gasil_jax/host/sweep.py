@@ -79,6 +79,15 @@ class Recording:
 
 
 @dataclasses.dataclass(frozen=True)
+class Start:
+    """The trained policy that runs start from."""
+
+    run: str  # the folder of its run
+    seed: int
+    sha256: str  # hash of its checkpoint
+
+
+@dataclasses.dataclass(frozen=True)
 class Sweep:
     """The points and seeds of a folder."""
 
@@ -93,13 +102,29 @@ class Sweep:
     # Why no command line can make the environment or the algorithm again; None if one
     # can.
     only_python: str | None = None
+    # Those of further agents, trained beside it. Then each point has its "agent".
+    others: Sequence[Algorithm] = ()
+    # The trained policy that all runs start from; None starts from scratch.
+    start: Start | None = None
+
+    @property
+    def algorithms(self) -> tuple[Algorithm, ...]:
+        """The algorithms of all agents."""
+        return (self.algorithm, *self.others)
+
+    @property
+    def agent(self) -> str:
+        """The names of all agents, separated by commas."""
+        return ",".join(x.agent.name for x in self.algorithms)
 
     @functools.cached_property
     def runs(self) -> Mapping[tuple[int, int], Run]:
         """The run of each (index of the point, seed)."""
-        changed = [self.algorithm.replace(**values) for values in self.points]
+        every = [points.algorithm_of(x, self.algorithms) for x in self.points]
+        changed = [algorithm.replace(**values) for algorithm, values in every]
+        start = None if self.start is None else self.start.sha256
         return {
-            (index, seed): Run(self.env, algorithm, seed, self.settings)
+            (index, seed): Run(self.env, algorithm, seed, self.settings, start=start)
             for index, algorithm in enumerate(changed)
             for seed in self.seeds
         }
@@ -151,16 +176,17 @@ class Sweep:
 
     def write(self, folder: pathlib.Path) -> None:
         """Write config.json."""
-        described = descriptions.describe(self.algorithm).items()
-        algorithm = {name: "a function" if callable(x) else x for name, x in described}
+        algorithm, *others = map(descriptions.describe, self.algorithms)
         content = {
             "env": self.env,
             "settings": self.settings,
             "algorithm": algorithm,
+            "others": others,
             "points": [dict(point) for point in self.points],
             "seeds": list(self.seeds),
             "recording": self.recording,
             "preset": self.preset,
+            "start": self.start,
             "only_python": self.only_python,
             "expert_sha256": _expert_hash(self),
         }
@@ -192,8 +218,8 @@ class Sweep:
                 "and seeds may grow, and only checkpoint_every, keep_checkpoints, "
                 "video_every, devices and log may differ"
             )
-        every = points.completed([*stored["points"], *self.points], self.algorithm)
-        return dataclasses.replace(self, points=every)
+        every = points.completed([*stored["points"], *self.points], *self.algorithms)
+        return dataclasses.replace(self, points=every, start=stored.get("start"))
 
 
 class Config(TypedDict, total=False):
@@ -202,11 +228,13 @@ class Config(TypedDict, total=False):
     env: Required[str]
     settings: Required[Settings]
     algorithm: Required[dict[str, Any]]
-    points: Required[tuple[dict[str, float], ...]]
+    others: tuple[dict[str, Any], ...]
+    points: Required[tuple[dict[str, float | str], ...]]
     seeds: Required[tuple[int, ...]]
     recording: Required[Recording]
     preset: Required[str | None]
     only_python: Required[str | None]
+    start: Start | None
     expert_sha256: str | None
 
 
@@ -246,18 +274,22 @@ def made(
         _note_imports(folder, stored)
         if algorithm is None:
             algorithm = descriptions.read(stored["algorithm"])
-        algorithms.check(algorithm)
-        points.check(stored["points"], algorithm, source="points: ")
-        every = points.completed(stored["points"], algorithm)
+        others = tuple(map(descriptions.read, stored.get("others", ())))
+        for each in (algorithm, *others):
+            algorithms.check(each)
+        points.check(stored["points"], algorithm, *others, source="points: ")
+        every = points.completed(stored["points"], algorithm, *others)
     names = ("env", "settings", "seeds", "recording", "preset", "only_python")
     fields: dict[str, Any] = {name: stored[name] for name in names}  # type: ignore[literal-required]
+    fields |= {"others": others, "start": stored.get("start")}
     return Sweep(algorithm=algorithm, points=every, **fields)
 
 
 def _note_imports(folder: pathlib.Path, stored: Config) -> None:
     """Print which modules a config.json names, which its reader imports."""
-    algorithm = stored["algorithm"]
-    named = [stored["env"], algorithm.get("agent"), *algorithm.get("rewards", ())]
+    named: list[Any] = [stored["env"]]
+    for each in (stored["algorithm"], *stored.get("others", ())):
+        named += [each.get("agent"), *each.get("rewards", ())]
     modules = {str(name).partition(":")[0] for name in named if ":" in str(name)}
     new = sorted(modules - {*environments.FAMILIES, *sys.modules})
     if new:
@@ -275,41 +307,43 @@ def check_seeds(seeds: Sequence[int]) -> None:
 
 def _differences(before: Config, now: Sweep) -> list[str]:
     """Return "NAME was A, is B" for each field in which two sweeps must not differ."""
-    old, new = before["algorithm"], descriptions.describe(now.algorithm)
-    if old.get("agent") != new["agent"]:
-        return [f"agent was {old.get('agent')}, is {new['agent']}"]
+    old, new = (before["algorithm"], *before.get("others", ())), now.algorithms
+    agents = ",".join(str(x.get("agent")) for x in old)
+    if agents != now.agent:
+        return [f"agent was {agents}, is {now.agent}"]
     evaluations = ("evaluate_every", "evaluate_episodes")
     recordings = (before["recording"], now.recording)
     changes = []
     for was, then in (
         ({"env": before["env"]}, {"env": now.env}),
         (vars(before["settings"]), vars(now.settings)),
-        (old, new),
+        *zip(old, map(descriptions.describe, new), strict=True),
         [{x: getattr(each, x) for x in evaluations} for each in recordings],
     ):
         for name, value in was.items():
-            other = "a function" if callable(then.get(name)) else then.get(name)
             if name in ("total_steps", "expert"):
                 continue
-            if json_files.as_type(Any, value, name) != other:
+            if json_files.as_type(Any, value, name) != (other := then.get(name)):
                 changes.append(f"{name} was {shown(value)}, is {shown(other)}")
-    if now.algorithm.config.total_steps < old["total_steps"]:
-        changes.append(f"total_steps was {old['total_steps']}")
+    if now.algorithm.config.total_steps < old[0]["total_steps"]:
+        changes.append(f"total_steps was {old[0]['total_steps']}")
     if not set(before["seeds"]) <= set(now.seeds):
         changes.append(f"seeds were {shown(list(before['seeds']))}")
+    start = before.get("start")
+    if now.start and (start is None or start.sha256 != now.start.sha256):
+        changes.append(f"init_from was {start and start.run}, is {now.start.run}")
     if before.get("expert_sha256") != _expert_hash(now):
         changes.append("the trajectories of the expert were others")
     return changes
 
 
 def _expert_hash(sweep: Sweep) -> str | None:
-    """Return the hash of the expert's trajectories, None without an expert."""
-    agent, digest = sweep.algorithm.agent, hashlib.sha256()
-    if getattr(agent, "expert", None) is None:
-        return None
-    for values in jax.tree.leaves(agent.data()):
+    """Return the hash of the experts' trajectories, None without an expert."""
+    agents = [x.agent for x in sweep.algorithms if getattr(x.agent, "expert", None)]
+    digest = hashlib.sha256()
+    for values in jax.tree.leaves([agent.data() for agent in agents]):
         digest.update(values.tobytes())
-    return digest.hexdigest()
+    return digest.hexdigest() if agents else None
 
 
 def parse_shard(text: str) -> tuple[int, int]:

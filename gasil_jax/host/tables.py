@@ -38,14 +38,9 @@ SUMMARIZED = ("episode_return", "episode_length", "skipped_updates", "faulty_ste
 class TableWriter:
     """Appends a row for each member and iteration to a table.
 
-    The cell of a value that is not finite (no episode ended yet, no discriminator) is
-    empty. Reading the others as float32 gives the numbers that were written.
-
-    Of an existing file it keeps the rows that the checkpoint has seen which training
-    continues from, and refuses one that lacks some; later ones are written again.
-
-    Attributes:
-      rows: number of rows so far.
+    The cell of a value that is not finite is empty. Reading the others as float32 gives
+    the numbers that were written. Of an existing file it keeps `rows` rows, those that
+    the checkpoint has seen which training continues from, and refuses one with less.
     """
 
     def __init__(

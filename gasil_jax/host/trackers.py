@@ -1,9 +1,7 @@
 """Log metrics to TensorBoard and Weights & Biases, besides metrics.csv.
 
-A tracker gets the metrics that metrics.csv gets, and as "evaluation" the mean return of
-an evaluation. Steps are environment steps per member. Weights & Biases has a run for
-each member, and groups them. TensorBoard has one run: "mean/NAME" is a metric's mean
-over the members, "episode_return/LABEL" and "evaluation/LABEL" are those of one member.
+Steps are environment steps per member. Weights & Biases has a run for each member;
+TensorBoard has one, with means over the members and each member's returns.
 """
 
 import contextlib

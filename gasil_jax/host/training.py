@@ -58,7 +58,7 @@ def _check(env: Any, algorithm: Algorithm) -> None:
     """Check that an algorithm can run in an environment; trace what is the user's."""
 
     def begin() -> Any:
-        state = train.init(env, algorithm, jax.random.key(0))
+        state = train.first_state(env, algorithm, jax.random.key(0))
         return train.train_step(env, algorithm, state)
 
     checks.check(env, algorithm)

@@ -1,8 +1,4 @@
-"""Run an episode of a policy and draw it, after training or in between.
-
-MuJoCo draws locomotion off screen. The point mass is drawn as the path of an episode.
-Other environments draw themselves.
-"""
+"""Run an episode of a policy and draw it, after training or in between."""
 
 import contextlib
 import os
@@ -24,8 +20,7 @@ import numpy as np
 from gasil_envs import pictures, wrappers
 from gasil_jax import policy, rollout
 from gasil_jax.host import output_file
-from gasil_jax.host.intervals import Interval
-from gasil_jax.host.members import Members, member
+from gasil_jax.host.members import Interval, Members, member
 from gasil_jax.host.progress import Progress
 from gasil_jax.host.trackers import Tracker
 
@@ -145,14 +140,7 @@ def write_strip(
 
 
 class Videos:
-    """Films the policy of the first member, as STEPS.gif, also for the trackers.
-
-    Training does not change by a single bit. What can't be drawn is a warning, once.
-
-    Attributes:
-      interval: when to film, beside the final policy.
-      seconds: time of all films in this process, including compilation.
-    """
+    """Films the policy of the first member, as STEPS.gif, also for the trackers."""
 
     def __init__(
         self,

@@ -145,7 +145,8 @@ def test_every_command_takes_it(tmp_path, capsys):
     results = tmp_path / "parts" / "results.csv"
     table = next((tmp_path / "parts").glob("programs/*/metrics.csv"))
     assert column(results, "my_weight") == {0.1, 0.3} > column(table, "my_weight")
-    words = [*SMALL, "--grid", "my_weight=0.2,0.5"]
+    (tmp_path / "points.json").write_text('[{"my_weight": 0.2}, {"gamma": 0.9}]')
+    words = [*SMALL, "--points-file", "points.json"]
     _, requested = options.read(options.SweepOptions, words, "x")
     (program,) = requested.unfinished(tmp_path)
     assert [x["my_weight"] for x in program.hyperparameters] == [0.2, 0.5]
@@ -262,7 +263,7 @@ def test_a_model_of_rewards_is_taken_by_every_command(my_models, tmp_path, capsy
     assert render.main(["out", "--out", "x.png", "--steps", "5"]) == 0
     again = ["--resume", "--out", "out", "--rewards", "my_models:Wrong0"]
     told = refused(capsys, run, *again)
-    assert "rewards was ['my_models:Signs'], is ['my_mod" in told
+    assert "rewards was ('my_models:Signs',), is ('my_mod" in told
 
 
 @pytest.mark.parametrize(

@@ -60,10 +60,10 @@ hopper --log tensorboard tensorboard | log has 'tensorboard' twice: name it once
 hopper --resume=3 | resume: ignored explicit argument '3'
 hopper ant | 'ant' is not an option or its value: see --help
 mass --max-episode-steps 51 | from 1 to 50, the environment's
-mass --evaluate-every 0 | evaluate_every is 0: it must be from 1
-mass --video-every 0 | video_every is 0: it must be from 1
+mass --evaluate-every 0 | evaluate_every is 0: it must be a whole number, 1
+mass --video-every 0 | video_every is 0: it must be a whole number, 1
 mass --evaluate-episodes 3 | evaluate_episodes is 3: it needs evaluate_every
-mass --evaluate-every 9 --evaluate-episodes 1e12 | GB of memory
+mass --evaluate-every 9 --evaluate-episodes 2e9 | GB of memory
 mass --out LONGx | too long
 mass --alpha LONGx | alpha is 'xxxxxxxxxxxxxxxxxxxxxxxxxxxxxx
 mass --agent gail | expert is missing
@@ -74,6 +74,7 @@ corridor --policy-components 4 | policy_components is 4: it must be 1, the
 sweep | grid is empty
 sweep --agent ppo --random 5 | random is 5: it must be from 1 to 4, of 4 points
 sweep --random 3 --grid alpha=0.1,0.2,0.1 | it must be from 1 to 2, of 2 points
+sweep --points-file no.json | no.json, which can't be read
 grid alhpa=1 | did you mean 'alpha'
 grid alpha=1 --agent ppo | gail, not of ppo. What can vary: batch_steps
 grid buffer_steps=9 --agent ppo+sil | buffer_steps is a setting of ppo+bc, ppo+bc+n
@@ -82,6 +83,7 @@ grid num_envs=1,2 | 'num_envs' can't vary: it must be one of batch_steps
 grid alpha=1,big | it must be numbers, like alpha=0.1,0.2
 grid buffer_steps=1.5 | whole numbers, like buffer_steps=10,20
 grid alpha=0.02,0.1 alpha=0.2 | grid has alpha twice
+grid alpha=1 --points-file x | points_file can't be combined with grid
 grid policy_components=1,4 --env sparse:key_grid | policy_components is 4: it must be 1
 grid alpha=1 --shard 1/1 | shard needs --out
 grid alpha=1 --shards 3 | shards is 3: it needs --launcher
@@ -111,7 +113,7 @@ resume --gamma 0.5 | gamma was 0.98, is 0.5: only total_steps and seeds
 resume --obs-noise 0.2 --num-epochs 3 | num_epochs was 2, is 3
 resume --seeds 2 | seeds were [5, 6, 7]: only total_steps and seeds may
 resume --evaluate-every 300 | evaluate_every was 512, is 300
-score --checkpoint first | checkpoint: invalid choice: 'first' (choose from
+score --checkpoint first | checkpoint is 'first': it must be one of last, be
 score --episodes 1000000000000 | GB of memory
 score --seed 8 | seed is 8: the run has 5, 6, 7
 score --point 1 | point is 1: 

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import pathlib
 import re
 import shutil
 import signal
@@ -10,10 +11,11 @@ import subprocess
 import sys
 import types
 
+import jax
 import numpy as np
 import pytest
-from refusals import rows
-from small_training import table
+from refusals import refused, rows
+from small_training import FLAGS, table
 
 import gasil_jax
 from gasil_envs import user_code
@@ -21,8 +23,8 @@ from gasil_jax import run
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import Options
 from gasil_jax.cli.reporting import HelpShown, reports_errors
+from gasil_jax.host import checkpoint, saved, start, training
 from gasil_jax.host import sweep as sweep_
-from gasil_jax.host import training
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -257,6 +259,32 @@ def test_a_task_without_a_tuned_preset_is_told(words, message, capsys):
     options_.note_if_untuned(*read, env)
     lines = notes(capsys)
     assert len(lines) == bool(message) and all(message in line for line in lines)
+
+
+def test_training_starts_from_another_runs_policy(
+    trained, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    first = str(trained.folder)
+    more = ("--agent", "ppo", "--init-from", first, "--evaluate-every", "128")
+    assert run.main([*FLAGS, *more, "--keep-checkpoints", "3", "--out", "second"]) == 0
+    (stored,) = tmp_path.glob("second/**/00000000")
+    *_, last = saved.load(pathlib.Path("second"))
+    begun = checkpoint.read(stored).restore(jax.eval_shape(lambda: last))
+    best = start.find(trained.folder).seed
+    *_, expected = saved.load(trained.folder, seed=best)
+    for part in (lambda x: x.actor_critic.policy.params, lambda x: x.normalizer):
+        jax.tree.map(np.testing.assert_array_equal, part(begun), part(expected))
+    assert begun.iteration.tolist() == [0]
+    # It is not the run that starts from scratch, and other policies are refused.
+    (one,) = sweep_.read(pathlib.Path("second")).runs.values()
+    assert one.key != dataclasses.replace(one, start=None).key
+    for words, why in (
+        (("--init-from", first, "--layer-norm"), "has another form: "),
+        (("--init-from", "nowhere"), "nowhere, which does not exist"),
+    ):
+        assert why in refused(capsys, run, *FLAGS, *words)
+    assert not pathlib.Path("runs").exists()
 
 
 def test_the_settings_of_a_config_are_taken(trained, tmp_path, capsys):

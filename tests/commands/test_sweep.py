@@ -2,6 +2,7 @@
 
 import json
 import os
+import pathlib
 import re
 import signal
 
@@ -11,13 +12,15 @@ import pytest
 from refusals import refused, rows
 from small_training import FLAGS, table
 
-from gasil_jax import sweep
+import gasil_jax
+from gasil_jax import plot, run, sweep
 from gasil_jax.cli import options as options_
 from gasil_jax.cli.options import SweepOptions
 from gasil_jax.errors import InputError
 from gasil_jax.host import points, saved, training
 from gasil_jax.host.members import Members
 from gasil_jax.host.points import PAPER_RANGES
+from gasil_jax.host.sweep import read as read_sweep
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -52,6 +55,32 @@ def test_random_points_are_distinct_and_of_the_papers_ranges(monkeypatch):
         assert all(value in PAPER_RANGES[name] for name, value in point.items())
     # So a sweep can grow by more of them.
     assert points_of("--random", "4") == drawn[:4]
+
+
+def test_points_from_a_file(tmp_path):
+    path = tmp_path / "points.json"
+    path.write_text('[{"alpha": 1, "buffer_steps": 500}, {"learning_rate": 1e-4}]')
+    own = options_.read(SweepOptions, ["--env", "point_mass", "--random", "1"], "x")[1]
+    default = own.algorithm.settings
+    # A point that does not name a value has the sweep's own.
+    assert points_of("--points-file", str(path)) == [
+        {"alpha": 1.0, "buffer_steps": 500, "learning_rate": default["learning_rate"]},
+        {
+            "alpha": default["alpha"],
+            "buffer_steps": default["buffer_steps"],
+            "learning_rate": 1e-4,
+        },
+    ]
+    for text, message in (
+        ("[" * 100_000, "is damaged"),
+        ("[3]", "is damaged: its content is 3"),
+        ("[]", "it must list a point or more"),
+        ('[{"alhpa": 1}]', "did you mean 'alpha'"),
+        ('[{"buffer_steps": 1.5}]', "buffer_steps is 1.5: it must be a whole number"),
+    ):
+        path.write_text(text)
+        with pytest.raises(InputError, match=message):
+            points_of("--points-file", str(path))
 
 
 def test_a_sweep_from_end_to_end(swept):
@@ -139,6 +168,7 @@ GROWN = """
 --grid alpha=0.5 | --grid alpha=0.1 | 0.5, 0.1
 --grid alpha=0.5 gamma=0.9,0.98 | --grid alpha=0.5,2 | 0.5 0.9, 0.5 0.98, 2 0.98
 --grid alpha=0.5 | --grid gamma=0.9,0.98 alpha=0.5 | 0.5 0.98, 0.5 0.9
+--points-file a.json | --grid alpha=0.5 | 0.7, 0.5
 """
 
 
@@ -147,7 +177,11 @@ def test_a_sweep_continues_and_grows(
     before, more, expected, tmp_path, monkeypatch, planned
 ):
     monkeypatch.chdir(tmp_path)
+    file = tmp_path / "a.json"
+    file.write_text('[{"alpha": 0.7}]')
     again = begun(tmp_path / "s", *before.split())
+    # Its config.json has the points as well.
+    file.unlink()
     assert sweep.main([*again, *more.split()]) == 2
     ((requested, programs),) = planned
     points = [[float(x) for x in point.split()] for point in expected.split(",")]
@@ -210,3 +244,39 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
         assert (out / name).read_bytes() == (whole / name).read_bytes(), name
     # The first program was finished, and is left as it was.
     assert (first / "training.json").read_bytes() == seconds
+
+
+def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
+    own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")
+    assert run.main([*FLAGS, *agents, *own, "--out", "out"]) == 0
+    rows = table("out/results.csv")
+    assert [row["agent"] for row in rows] == ["ppo", "ppo+sil"]
+    stored = read_sweep(pathlib.Path("out"))
+    # Each has its own preset, and of what is given what it has.
+    for each in stored.algorithms:
+        preset = gasil_jax.preset("point_mass", each.agent.name)
+        same = "learning_rate", "gae_lambda"
+        assert [each.settings[x] for x in same] == [preset.settings[x] for x in same]
+        assert each.settings["gamma"] == 0.9
+    assert stored.others[0].settings["sil_coefficient"] == 0.3
+    # What only one of them measures is not known of the other.
+    curves = np.load("out/curves.npz")
+    only = [x for x in curves.files if np.isnan(curves[x][0]).all()]
+    assert only and np.isfinite(curves["policy_loss"]).all()
+    # They grow by points, in the same programs.
+    assert sweep.main(["--resume", "--out", "out", "--grid", "gamma=0.8"]) == 0
+    assert len(read_sweep(pathlib.Path("out")).points) == 4
+    assert plot.main(["out", "--out", "x.png"]) == 0
+    told = capsys.readouterr()
+    assert "point_mass, ppo " in told.out and "point_mass, ppo+sil " in told.out
+    for words, why in (
+        (("--agent", "ppo,ppo"), "agent has 'ppo' twice"),
+        (("--resume", "--agent", "ppo"), "agent was ppo,ppo+sil, is ppo"),
+        (("--agent", "ppo,gail", "--grid", "gamma=1", "agent=x"), "as --agent A,B"),
+        (("--agent", "ppo,gasil", "--grid", "alpha=1"), "not of ppo. What can vary"),
+    ):
+        out = "out" if "--resume" in words else "new"
+        assert sweep.main([*FLAGS, *words, "--out", out]) == 2
+        assert why in capsys.readouterr().err

@@ -19,6 +19,7 @@ from experiments.figures import FIGURES
 from experiments.store import Record, Store, read
 from gasil_jax.errors import InputError
 from gasil_jax.evaluation import evaluate
+from gasil_jax.host import interruption
 from gasil_jax.host.evaluations import evaluation_key
 from gasil_jax.host.members import Members
 from gasil_jax.host.runs import Run
@@ -206,7 +207,7 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
         status = __main__.main([*command, "--processes", "2"])
     assert status == 128 + signal.SIGTERM
     assert capsys.readouterr().err.splitlines() == [
-        engine._ENDING,
+        interruption.ANSWER,
         "interrupted by SIGTERM; all that was done is saved",
         "continue with: the same command and --resume",
     ]

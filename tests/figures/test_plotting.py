@@ -75,22 +75,22 @@ def test_the_learning_curve_is_the_same_statistic(figures, tmp_path):
 
 
 def test_a_sweep_has_a_panel_for_each_hyperparameter(figures, tmp_path):
-    alphas, epochs = (0.02, 0.1, 1.0), (2, 4, 6)
-    points = [(x, y) for x in alphas for y in epochs]
-    values = dict(zip(("alpha", "num_epochs"), zip(*points)))
+    alphas, rules = (0.02, 0.1, 1.0), ("gap", "both", "fixed")
+    points = [(x, y) for x in alphas for y in rules]
+    values = dict(zip(("alpha", "imitation_rule"), zip(*points)))
     values["gamma"] = tuple(np.linspace(0.9, 0.99, 9))
     returns = np.arange(9.0)
     plotting.marginals(
         tmp_path / "x.png", values, returns, title="t", best=8, left_out=2
     )
     (figure,) = figures
-    alpha, epochs, gamma = figure.axes
+    alpha, rule, gamma = figure.axes
     assert alpha.get_xlabel() == "alpha" and alpha.get_xscale() == "log"
-    assert epochs.get_xticks().tolist() == [2, 4, 6]
+    assert [x.get_text() for x in rule.get_xticklabels()] == ["gap", "both", "fixed"]
     means, _, star = alpha.get_lines()
     np.testing.assert_allclose(means.get_ydata(), [1.0, 4.0, 7.0])
     assert (star.get_xdata(), star.get_ydata()) == (1.0, 8.0)
-    np.testing.assert_allclose(epochs.get_lines()[0].get_ydata(), [3.0, 4.0, 5.0])
+    np.testing.assert_allclose(rule.get_lines()[0].get_ydata(), [3.0, 4.0, 5.0])
     np.testing.assert_allclose(gamma.get_lines()[0].get_ydata(), returns)
     caption = figure.get_supxlabel().replace("\n", " ")
     assert "2 of 11 points are left out, because a seed has no return" in caption
