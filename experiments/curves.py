@@ -158,8 +158,8 @@ class Figure:
         A kind is "dense" or "delayed" for locomotion, with "100" behind it for a delay
         that is longer than the usual one and "raw" for rewards that are not normalized,
         or "others". Of sparse tasks it is "robots" or "navix", and "noisy" for noise on
-        the actions. Without a kind they are all panels, or the sparse ones of no such
-        kind.
+        the actions; "all robots" are with and without noise. Without a kind they are
+        all panels, or the sparse ones of no such kind.
         """
 
         def words(panel: str) -> set[str]:
@@ -182,8 +182,11 @@ class Figure:
 
         if kind in self.panels:
             return [kind]
-        of_all = not kind and self.solved_from is None
-        return [x for x in self.panels if of_all or words(x) == set(kind.split())]
+        asked, of_all = set(kind.split()), not kind and self.solved_from is None
+        others = {"noisy"} if "all" in asked else set()
+        return [
+            x for x in self.panels if of_all or words(x) - others == asked - {"all"}
+        ]
 
     def point_of(self, panel: str, name: str) -> tuple[str, Any]:
         """Return the name of the line that a curve belongs to, and its x value."""

@@ -191,16 +191,23 @@ class Results:
         return start, max(float(interquartile_mean(x.final)) for x in own)
 
     def whole(self, kind: str = "") -> Whole:
-        """Return each curve's mean over the panels of a kind, if it is complete on all.
+        """Return each curve's mean over `measured` panels, if it is complete on these.
 
         Where tasks are either solved or not, it is the share of seeds, else the
         interquartile mean of scores, which are returns on `scale`. There is no mean of
         panels that share a task, and none of two curves alone.
         """
         if kind not in self._wholes:
-            whole = self._whole(self.figure.of_kind(kind))
+            whole = self._whole(self.measured(kind))
             self._wholes[kind] = whole if len(whole) > 2 else {}
         return self._wholes[kind]
+
+    def measured(self, kind: str = "") -> list[str]:
+        """Return the panels where all is complete that is shown in panels of a kind."""
+        figure, panels = self.figure, self.figure.of_kind(kind)
+        own = {figure.favourite, *figure.shown}
+        own = own.intersection(*(figure.panels[panel] for panel in panels))
+        return [p for p in panels if own and all((p, x) in self.scores for x in own)]
 
     def _whole(self, panels: Sequence[str]) -> Whole:
         figure, scores, whole = self.figure, self.scores, Whole()
@@ -300,12 +307,14 @@ class Results:
 
 def families(pages: Sequence[Results]) -> dict[str, tuple[Results, str]]:
     """Return the families of figures' tasks of which runs are stored, by title."""
-    return {
-        title: (results, kind)
-        for results in pages
-        for title, kind in FAMILIES.items()
-        if (kind or results.figure.solved_from) and results.whole(kind)
-    }
+    shown = {}
+    for results in pages:
+        for title, kind in FAMILIES.items():
+            if (kind or results.figure.solved_from) and results.whole(kind):
+                own, every = results.measured(kind), results.figure.of_kind(kind)
+                some = f", {len(own)} of {len(every)} tasks" * (own != every)
+                shown[title + some] = results, kind
+    return shown
 
 
 def arms(pages: Sequence[Results]) -> list[str]:

@@ -426,7 +426,6 @@ _CAUSES = [
     Arm("cloning", "ppo+bc", _CLONED),
     Arm("cloning, 10,000 steps", "ppo+bc", {**_CLONED, **_LARGE}),
     Arm("cloning, one episode", "ppo+bc", {**_CLONED, "buffer_episodes": 1}),
-    Arm("cloning, by the gap", "ppo+bc-adaptive", _CLONED),
     Arm("novel ties", "ppo+bc+novelty", {**_CLONED, "novelty_coefficient": 0.0}),
     Arm("novelty", "ppo+novelty"),
     Arm("novelty, cloning", "ppo+bc+novelty", _CLONED),
@@ -440,10 +439,7 @@ _CHANGES = [
     ("cloning", "gasil, centered"),
     ("cloning", "ppo"),
     ("novel ties", "cloning"),
-    *(
-        (f"cloning, {x}", "cloning")
-        for x in ("10,000 steps", "one episode", "by the gap")
-    ),
+    *((f"cloning, {x}", "cloning") for x in ("10,000 steps", "one episode")),
     ("novelty", "ppo"),
     ("novelty, cloning", "novelty"),
 ]
@@ -715,8 +711,9 @@ FIGURES: Mapping[str, Figure] = {
             total_steps=SPARSE_STEPS,
         ),
         pairs=_CHANGES,
-        # Absorbing ends, newer ties and admission, of cloning too, and the oldest ties.
-        dropped_pairs=6,
+        # Absorbing ends, newer ties and admission, of cloning too, the oldest ties, and
+        # cloning by the gap.
+        dropped_pairs=7,
         solved_from=solved_from,
     ),
     "deep_sea": Figure(

@@ -21,6 +21,7 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.statistics import interquartile_mean
 
+_ALL = "All runs are trained."
 #: Mean returns that others have published, after about 1M steps, with their sources.
 PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 
@@ -121,14 +122,26 @@ def numbers(results: Results, kind: str = "") -> str:
     if any(floors):
         rows.append(["doing nothing", *(number(x.mean) if x else "" for x in floors)])
     head = ["", *(x.removeprefix("sparse:") for x in panels)]
-    asked = results.figure.of_kind(kind)
-    total = sum(x.seeds for panel, _, x in results.figure.curves() if panel in asked)
-    stored = sum(len(x.records) for key, x in results.curves.items() if key[0] in asked)
-    lacking = f"Not trained yet: {total - stored} of {total} runs." * (stored < total)
-    parts = [lacking, markdown_table(head, rows)]
+    told = lacking(results, kind)
+    parts = [told if told != _ALL else "", markdown_table(head, rows)]
     for sooner in (False, True) if results.sooner else (False,):
         parts.append(_compared(results.forest(kind, sooner), results, sooner))
     return folded("Numbers", *parts)
+
+
+def lacking(results: Results, kind: str = "") -> str:
+    """Return how many runs of a kind are not trained yet, and of which panels."""
+    asked, total, left = results.figure.of_kind(kind), 0, dict[str, int]()
+    for panel, name, curve in results.figure.curves():
+        one = results.curves.get((panel, name))
+        missing = curve.seeds - (len(one.records) if one else 0)
+        if panel in asked:
+            total += curve.seeds
+            left |= {panel: left.get(panel, 0) + missing} if missing else {}
+    if not left:
+        return _ALL
+    runs = f"{sum(left.values())} of {total} runs"
+    return f"Not trained yet: {runs}. They are of {', '.join(left)}."
 
 
 def _measured(results: Results, panel: str) -> bool:
@@ -351,6 +364,6 @@ SLOTS: Mapping[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(claim, curves, forest, numbers, final, search, apart, count, likely, below),
-        *(foretold, passing, published, grids, share, tasks, rule),
+        *(foretold, passing, published, grids, share, tasks, rule, lacking),
     )
 }

@@ -4,15 +4,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import gasil_jax
-from experiments.agents.adaptive_cloning import PPOBCAdaptive
 from experiments.agents.constant_bonus import PPOBonus
 from gasil_jax.algorithms import Algorithm
 
 #: The experiments' own agents, by the names that figures and stored runs have for them.
-OWN: Mapping[str, type[gasil_jax.Agent]] = {
-    "ppo+bonus": PPOBonus,
-    "ppo+bc-adaptive": PPOBCAdaptive,
-}
+OWN: Mapping[str, type[gasil_jax.Agent]] = {"ppo+bonus": PPOBonus}
 AGENTS: Mapping[str, type[gasil_jax.Agent]] = {**gasil_jax.agents.AGENTS, **OWN}
 
 

@@ -119,7 +119,6 @@ def test_a_task_s_own_functions_make_its_episodes():
             },
             "a medium or a free body without others, with implicitfast",
         ),
-        ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),
     ],
 )
 def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):
