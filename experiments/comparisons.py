@@ -118,19 +118,22 @@ def draws(scores: Scores, panel: str, curve: str) -> np.ndarray:
 
 
 @functools.cache
-def _splits(first: int, seeds: int) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Return ways to split seeds, (ways, seeds of a side), and if these are all."""
+def _splits(first: int, seeds: int) -> tuple[np.ndarray, bool]:
+    """Return ways to split ascending scores, (ways, seeds), and if these are all."""
     exact = math.comb(seeds, first) <= _MOST_SPLITS
     if exact:
-        ways = itertools.combinations(range(seeds), first)
-        chosen = np.array(list(ways))
+        chosen = np.array([*itertools.combinations(range(seeds), first)])
     else:
         rows = np.tile(np.arange(seeds), (_RANDOM_SPLITS, 1))
         dealt = np.random.default_rng(0).permuted(rows, axis=1)
         chosen = np.sort(dealt[:, :first], axis=1)
-    rest = np.ones((len(chosen), seeds), bool)
-    rest[np.arange(len(chosen))[:, None], chosen] = False
-    return chosen, np.nonzero(rest)[1].reshape(len(chosen), -1), exact
+    # A way times the scores is the difference of its sides' interquartile means.
+    taken = np.zeros((len(chosen), seeds), bool)
+    taken[np.arange(len(chosen))[:, None], chosen] = True
+    ways = np.empty(taken.shape)
+    ways[taken] = np.tile(_weights(first), len(chosen))
+    ways[~taken] = -np.tile(_weights(seeds - first), len(chosen))
+    return ways, exact
 
 
 @functools.cache
@@ -151,14 +154,11 @@ def permutation_p(ours: np.ndarray, other: np.ndarray) -> float:
     # The pair in either order is the same test and has the same random numbers.
     one, two = sorted([ours.tolist(), other.tolist()])
     pooled = np.sort(one + two)
-    first, second, exact = _splits(len(one), len(pooled))
-
-    def distance(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        return np.abs(first @ _weights(len(one)) - second @ _weights(len(two)))
-
-    dealt = distance(pooled[first], pooled[second])
+    ways, exact = _splits(len(one), len(pooled))
+    apart = np.sort(one) @ _weights(len(one)) - np.sort(two) @ _weights(len(two))
     # Sums in another order differ by rounding.
-    as_far = int((dealt >= distance(np.sort(one), np.sort(two)) * (1 - 1e-9)).sum())
+    dealt = np.abs(ways @ pooled) >= abs(apart) * (1 - 1e-9)
+    as_far = int(dealt.sum())
     return as_far / len(dealt) if exact else (1 + as_far) / (1 + len(dealt))
 
 

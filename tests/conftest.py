@@ -29,6 +29,8 @@ if importlib.metadata.version("jaxlib").startswith("0.10."):
     _flags += " --xla_cpu_parallel_codegen_split_count=1"
     os.environ["XLA_FLAGS"] = _flags.strip()
 
+# Where each operation was written is in no result; to note it takes a twentieth.
+os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")
 # What JAX traces and compiles stays alive: to look through all of it as often as Python
 # does by default takes a twentieth of the time.
 gc.set_threshold(100_000, 20, 20)
@@ -36,8 +38,9 @@ gc.set_threshold(100_000, 20, 20)
 # Compiling takes most of the time, so most of XLA's optimizations are turned off. Tests
 # with this mark check XLA's numbers or its memory, and are compiled as for users.
 _AS_FOR_USERS = "compiled_as_for_users"
-# Modules with tests that take long by themselves.
-_LONG = {"test_examples", "test_figures", "test_ray", "test_readme", "test_sweep"}
+# Modules with tests that take long by themselves, or together on one worker.
+_LONG = {"test_examples", "test_figures", "test_fitting", "test_ray", "test_readme"}
+_LONG |= {"test_report", "test_resume", "test_sweep"}
 
 
 def pytest_configure(config):
@@ -54,6 +57,11 @@ def pytest_collectstart():
     from gasil_envs.physics import host_threads
 
     host_threads.reserve(2)
+
+
+def pytest_collection_finish():
+    """Look no more through what has been imported."""
+    gc.freeze()
 
 
 def _is_optimized(item):

@@ -10,7 +10,7 @@ import subprocess
 import jax
 import numpy as np
 import pytest
-from small_training import SETTINGS, drawn_policies
+from small_training import FLAGS, SETTINGS, drawn_policies
 
 import gasil_jax
 from experiments.agents.constant_bonus import PPOBonus
@@ -32,10 +32,7 @@ TRAINING = {
     "gasil_jax.run": options.Options,
     "gasil_jax.sweep": options.SweepOptions,
 }
-SMALL = (
-    *("--total-steps", "256", "--batch-steps", "128", "--num-envs", "2"),
-    *("--num-epochs", "1", "--minibatch-size", "32", "--hidden-sizes", "8"),
-)
+SMALL = ("--total-steps", "512", *FLAGS[4:])
 #: What stands for an option's value when a command is run.
 TOY = {
     "--env": "point_mass",
@@ -319,7 +316,7 @@ def test_the_python_of_the_readme_runs(finished_hopper):
     assert names["action"].shape == (2,)
 
 
-def test_the_python_of_the_documentation_runs(finished_hopper):
+def test_the_python_of_the_documentation_runs(finished_hopper, figures):
     names = run_python(DOCS / "python.md")
     assert names["metrics"]["episode_return"].shape == (2, 2)  # seeds, iterations
     assert names["state"].iteration.shape == (2,)
@@ -354,7 +351,7 @@ def test_the_links_of_the_readme_lead_somewhere():
         assert (README.parent / target).exists(), target
 
 
-def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
+def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys, figures):
     out = tmp_path / "out"
     small = "--total-steps 256 --batch-steps 128 --num-envs 4 --reward-delay 7"
     both = ["--env", "my_tasks:Line", "--agent", "my_tasks:Scaled", *small.split()]
@@ -374,7 +371,7 @@ def test_the_documented_agent_and_task_train(my_tasks, tmp_path, capsys):
     assert "must be of a locomotion task" in capsys.readouterr().err
 
 
-def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
+def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path, figures):
     env = ["--env", "my_tasks:Quadruped", "--agent", "ppo"]
     out = tmp_path / "run"
     assert run.main([*env, *SMALL, "--seeds", "1", "--out", str(out)]) == 0
@@ -382,7 +379,7 @@ def test_the_documented_robot_trains_and_is_drawn(my_tasks, tmp_path):
     assert environments.can_be_drawn(saved.load(out)[0])
 
 
-def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys):
+def test_the_documented_network_trains_on_planes(my_tasks, tmp_path, capsys, figures):
     pytest.importorskip("gymnax")
     run_of_it = ["--env", "gymnax:Breakout-MinAtar", "--agent", "my_tasks:Planes"]
     out = tmp_path / "run"

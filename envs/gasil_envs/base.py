@@ -12,38 +12,26 @@ from flax import struct
 
 
 class State(struct.PyTreeNode):
-    """The state of an environment.
+    """The state of an environment."""
 
-    Attributes:
-      pipeline_state: the state of its physics, any pytree.
-      obs: float32 (obs,), the observation.
-      reward: float32 (), the reward of the last step.
-      done: float32 (), 1 if the episode has ended, else 0.
-      metrics: arrays to report, by name.
-      info: all else that the environment and its wrappers keep, by name.
-    """
-
-    pipeline_state: Any
-    obs: jax.Array
-    reward: jax.Array
-    done: jax.Array
+    pipeline_state: Any  # The state of its physics, any pytree.
+    obs: jax.Array  # float32 (obs,), the observation.
+    reward: jax.Array  # float32 (), the reward of the last step.
+    done: jax.Array  # float32 (), 1 if the episode has ended, else 0.
+    #: Arrays to report, by name.
     metrics: dict[str, jax.Array] = struct.field(default_factory=dict)
+    #: All else that the environment and its wrappers keep, by name.
     info: dict[str, Any] = struct.field(default_factory=dict)
 
 
 class Env:
-    """An environment: pure functions of its states.
+    """An environment: pure functions of its states."""
 
-    Attributes:
-      observation_size: number of numbers in an observation.
-      action_size: dimension of an action.
-      num_actions: number of discrete actions, of an environment without `action_size`.
-      episode_length: number of steps after which an episode is truncated, if it is.
-    """
-
-    observation_size: Any
-    action_size: Any
+    observation_size: Any  # Number of numbers in an observation.
+    action_size: Any  # Dimension of an action.
+    #: Number of discrete actions, of an environment without `action_size`.
     num_actions: Any
+    #: Number of steps after which an episode is truncated, if it is.
     episode_length: Any
 
     def reset(self, rng: jax.Array) -> State:
@@ -67,16 +55,13 @@ class Wrapper(Env):
         self.env = env
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode; consumes the key."""
         return self.env.reset(rng)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take one step."""
         return self.env.step(state, action)
 
     @property
     def unwrapped(self) -> Any:
-        """The environment without wrappers."""
         return self.env.unwrapped
 
     def __getattr__(self, name: str) -> Any:

@@ -51,11 +51,8 @@ def unknown(
 ) -> str:
     """Return the error message for a name that is not among the allowed ones.
 
-    Args:
-      kind: the kind of thing that is named, such as "agent".
-      name: the unknown name, or a value that is no string.
-      allowed: the names that exist.
-      forms: the forms of other allowed names, such as MODULE:NAME.
+    `kind` is what is named, such as "agent"; `forms` are those of other allowed names,
+    such as MODULE:NAME.
     """
     text = name if isinstance(name, str) else shown(name)
     return f"{kind} {shown(text)} is unknown: {did_you_mean(text, allowed, forms)}"

@@ -84,13 +84,7 @@ def _refuse_forking_caller() -> None:
 
 
 def _checked_action(action: Any, state: Any, space: gymnasium.Space[Any]) -> jax.Array:
-    """Return an action, or a batch of them, for a step from a state.
-
-    Raises:
-      ResetNeeded: if there is no state yet.
-      ValueError: if the action has another shape than the space, or is no number of a
-        discrete action.
-    """
+    """Return an action, or a batch of them, that a state and a space allow."""
     if state is None:
         raise gymnasium.error.ResetNeeded("step needs a reset before it")
     given = np.asarray(action)
@@ -118,18 +112,13 @@ def _where(mask: jax.Array, new: Any, old: Any) -> Any:
 
 
 class GymnasiumEnv(gymnasium.Env):
-    """A single environment with Gymnasium's interface.
+    """One of `gasil_envs.names()` with Gymnasium's interface.
 
-    Args:
-      name: one of `gasil_envs.names()`.
-      render_mode: "rgb_array" to draw pictures with `render`; default none. The
-        environment variable MUJOCO_GL chooses MuJoCo's OpenGL: egl needs no display.
-      width: width of a picture in pixels.
-      height: height of a picture in pixels.
-      **settings: arguments of `gasil_envs.make`.
-
-    An episode is truncated when it reaches the environment's own step limit, or that of
-    a `gymnasium.wrappers.TimeLimit` around it.
+    With `render_mode` "rgb_array", `render` draws pictures of so many pixels; the
+    environment variable MUJOCO_GL chooses MuJoCo's OpenGL: egl needs no display.
+    `settings` are arguments of `gasil_envs.make`. An episode is truncated when it
+    reaches the environment's own step limit, or that of a
+    `gymnasium.wrappers.TimeLimit` around it.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
@@ -164,11 +153,7 @@ class GymnasiumEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode and return its first observation, (obs,) float32.
-
-        Raises:
-          ValueError: if a `TimeLimit` allows more steps than the environment.
-        """
+        """Start an episode and return its first observation, (obs,) float32."""
         _refuse_fork()
         super().reset(seed=seed)
         self._limits = self._time_limits()
@@ -189,10 +174,6 @@ class GymnasiumEnv(gymnasium.Env):
         """Return observation, reward, terminated, truncated and info.
 
         ``info["true_reward"]`` is the reward without delay, 0 after a reset.
-
-        Raises:
-          ResetNeeded: if there was no reset before.
-          ValueError: if the action has another shape than ``action_space``.
         """
         _refuse_fork()
         given = _checked_action(action, self._state, self.action_space)
@@ -246,11 +227,7 @@ class GymnasiumEnv(gymnasium.Env):
 class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
     """A batch of environments; the step after an episode's end starts the next one.
 
-    Args:
-      name: one of `gasil_envs.names()`.
-      num_envs: number of environments.
-      render_mode: None; a batch can't be drawn.
-      **settings: arguments of `gasil_envs.make`.
+    `settings` are arguments of `gasil_envs.make`.
     """
 
     metadata = {  # noqa: RUF012
@@ -298,10 +275,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Start an episode in each and return the observations, (num_envs, obs).
 
         With ``options={"reset_mask": mask}``, bool (num_envs,), the others go on.
-
-        Raises:
-          ResetNeeded: if a mask is given before any reset.
-          ValueError: if the mask has another shape or type, or no environment is in it.
         """
         _refuse_fork()
         mask = None if options is None else options.get("reset_mask")
@@ -325,10 +298,6 @@ class GymnasiumVectorEnv(gymnasium.vector.VectorEnv):
         """Return observation (num_envs, obs), reward, terminated, truncated and info.
 
         Reward, terminated, truncated and the true reward in info are (num_envs,) each.
-
-        Raises:
-          ResetNeeded: if there was no reset before.
-          ValueError: if the actions have another shape than ``action_space``.
         """
         _refuse_fork()
         given = _checked_action(actions, self._state, self.action_space)

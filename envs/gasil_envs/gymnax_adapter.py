@@ -24,11 +24,9 @@ class Params(struct.PyTreeNode):
 
 
 class GymnaxEnv:
-    """One environment; use `jax.vmap` on its functions for many.
+    """One of `gasil_envs.names()`; use `jax.vmap` on its functions for many.
 
-    Args:
-      name: one of `gasil_envs.names()`.
-      **settings: arguments of `gasil_envs.make`.
+    `settings` are arguments of `gasil_envs.make`.
     """
 
     default_params = Params()
@@ -37,37 +35,20 @@ class GymnaxEnv:
         self.name = name
         self._env = wrappers.FaultyStepEnds(registry.make(name, **settings))
 
-    def reset(
-        self, key: jax.Array, params: Params | None = None
-    ) -> tuple[jax.Array, State]:
-        """Return the first observation, float32 (obs,), and the state.
-
-        The key is consumed.
-        """
+    def reset(self, key: jax.Array, params: Any = None) -> tuple[jax.Array, State]:
+        """Return the first observation, float32 (obs,), and the state."""
         state = self._env.reset(key)
         return state.obs, state
 
     def step(
-        self,
-        key: jax.Array,
-        state: State,
-        action: jax.Array,
-        params: Params | None = None,
+        self, key: jax.Array, state: State, action: jax.Array, params: Any = None
     ) -> Transition:
-        """Take a step; if the episode ends, start the next one.
+        """Take a step; if the episode ends, start the next one, with `key`.
 
-        Args:
-          key: key for the start of the next episode; consumed.
-          state: the state before the step.
-          action: float32 (action,), or int32 () where actions are discrete.
-          params: ignored; part of gymnax' interface.
-
-        Returns:
-          Observation, state, reward, terminated, truncated and info. The observation,
-          float32 (obs,), is that of the next episode if this one ended; the last
-          observation of this episode is ``info["final_observation"]``. The reward is
-          float32 (). Terminated and truncated are bool () and never both true.
-          ``info["true_reward"]`` is the reward without delay.
+        Returns observation, state, reward, terminated, truncated (never both) and info.
+        The observation, float32 (obs,), is the next episode's if this one ended, whose
+        last one is ``info["final_observation"]``. ``info["true_reward"]`` is the reward
+        without delay.
         """
         stepped, fresh = self._env.step(state, action), self._env.reset(key)
         ended = stepped.done > 0
@@ -108,7 +89,5 @@ def _spaces() -> Any:
 
 
 def _box(low: Any, high: Any, size: int) -> Any:
-    def wide(x: Any) -> jax.Array:
-        return jnp.broadcast_to(jnp.asarray(x, jnp.float32), (size,))
-
-    return _spaces().Box(wide(low), wide(high), (size,), jnp.float32)
+    low, high = (jnp.broadcast_to(jnp.float32(x), (size,)) for x in (low, high))
+    return _spaces().Box(low, high, (size,), jnp.float32)

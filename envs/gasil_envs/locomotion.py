@@ -8,7 +8,6 @@ reward, termination, start and frame skip are those of ``gymnasium.envs.mujoco.*
 import dataclasses
 import importlib.util
 import pathlib
-import types
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -218,150 +217,148 @@ def _start_of_pusher(key: jax.Array) -> tuple[jax.Array, jax.Array]:
 
 
 #: Gymnasium's tasks by name.
-TASKS: Mapping[str, Task] = types.MappingProxyType(
-    {
-        "hopper": Task(
-            gymnasium_id="Hopper-v5",
-            xml=ASSETS / "hopper.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            healthy_reward=1.0,
-            healthy_z=(0.7, float("inf")),
-            healthy_angle=(-0.2, 0.2),
-            healthy_state=(-100.0, 100.0),
-            max_velocity=10.0,
+TASKS: Mapping[str, Task] = {
+    "hopper": Task(
+        gymnasium_id="Hopper-v5",
+        xml=ASSETS / "hopper.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        healthy_reward=1.0,
+        healthy_z=(0.7, float("inf")),
+        healthy_angle=(-0.2, 0.2),
+        healthy_state=(-100.0, 100.0),
+        max_velocity=10.0,
+    ),
+    "walker2d": Task(
+        gymnasium_id="Walker2d-v5",
+        xml=ASSETS / "walker2d_v5.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        healthy_reward=1.0,
+        healthy_z=(0.8, 2.0),
+        healthy_angle=(-1.0, 1.0),
+        max_velocity=10.0,
+    ),
+    "halfcheetah": Task(
+        gymnasium_id="HalfCheetah-v5",
+        xml=ASSETS / "half_cheetah.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        control_cost=0.1,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+    ),
+    "swimmer": Task(
+        gymnasium_id="Swimmer-v5",
+        xml=ASSETS / "swimmer.xml",
+        frame_skip=4,
+        solver_iterations=4,
+        control_cost=1e-4,
+        reset_noise=0.1,
+        hidden_positions=2,
+    ),
+    "ant": Task(
+        gymnasium_id="Ant-v5",
+        xml=ASSETS / "ant.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        control_cost=0.5,
+        healthy_reward=1.0,
+        healthy_z=(0.2, 1.0),
+        z_index=2,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+        hidden_positions=2,
+        fields=("xpos", "cfrc_ext"),
+        position=_torso_position,
+        observe_more=_clipped_contact_forces,
+        contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
+    ),
+    "humanoid": Task(
+        gymnasium_id="Humanoid-v5",
+        xml=ASSETS / "humanoid.xml",
+        frame_skip=5,
+        solver_iterations=4,
+        forward_reward=1.25,
+        control_cost=0.1,
+        healthy_reward=5.0,
+        healthy_z=(1.0, 2.0),
+        z_index=2,
+        reset_noise=1e-2,
+        hidden_positions=2,
+        fields=("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
+        position=_mass_centre,
+        observe_more=_body_observations,
+        contact_cost=_impact_cost,
+    ),
+    "humanoidstandup": Task(
+        gymnasium_id="HumanoidStandup-v5",
+        xml=ASSETS / "humanoidstandup.xml",
+        frame_skip=5,
+        solver_iterations=8,
+        forward_reward=0.0,
+        control_cost=0.1,
+        healthy_reward=1.0,
+        reset_noise=1e-2,
+        hidden_positions=2,
+        fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
+        observe_more=_body_observations,
+        contact_cost=_impact_cost,
+        # The height over the duration of a time step.
+        reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
+    ),
+    "inverted_pendulum": Task(
+        gymnasium_id="InvertedPendulum-v5",
+        xml=ASSETS / "inverted_pendulum.xml",
+        frame_skip=2,
+        forward_reward=0.0,
+        control_cost=0.0,
+        healthy_reward=1.0,
+        reset_noise=1e-2,
+        hidden_positions=0,
+        healthy=lambda state, fields: jnp.abs(state.qpos[1]) <= 0.2,
+    ),
+    "inverted_double_pendulum": Task(
+        gymnasium_id="InvertedDoublePendulum-v5",
+        xml=ASSETS / "inverted_double_pendulum.xml",
+        frame_skip=5,
+        forward_reward=0.0,
+        control_cost=0.0,
+        healthy_reward=10.0,
+        reset_noise=0.1,
+        normal_velocity_noise=True,
+        fields=("xpos", "xipos", "qfrc_constraint"),
+        observe=_observe_poles,
+        reward=_reward_of_poles,
+        healthy=lambda state, fields: _tip(fields)[2] > 1.0,
+    ),
+    "reacher": Task(
+        gymnasium_id="Reacher-v5",
+        xml=ASSETS / "reacher.xml",
+        frame_skip=2,
+        forward_reward=0.0,
+        control_cost=1.0,
+        fields=("xpos",),
+        observe=_observe_reacher,
+        reward=lambda before, after, fields, action: (
+            -jnp.linalg.norm(_to_target(fields))
         ),
-        "walker2d": Task(
-            gymnasium_id="Walker2d-v5",
-            xml=ASSETS / "walker2d_v5.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            healthy_reward=1.0,
-            healthy_z=(0.8, 2.0),
-            healthy_angle=(-1.0, 1.0),
-            max_velocity=10.0,
-        ),
-        "halfcheetah": Task(
-            gymnasium_id="HalfCheetah-v5",
-            xml=ASSETS / "half_cheetah.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            control_cost=0.1,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-        ),
-        "swimmer": Task(
-            gymnasium_id="Swimmer-v5",
-            xml=ASSETS / "swimmer.xml",
-            frame_skip=4,
-            solver_iterations=4,
-            control_cost=1e-4,
-            reset_noise=0.1,
-            hidden_positions=2,
-        ),
-        "ant": Task(
-            gymnasium_id="Ant-v5",
-            xml=ASSETS / "ant.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            control_cost=0.5,
-            healthy_reward=1.0,
-            healthy_z=(0.2, 1.0),
-            z_index=2,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-            hidden_positions=2,
-            fields=("xpos", "cfrc_ext"),
-            position=_torso_position,
-            observe_more=_clipped_contact_forces,
-            contact_cost=lambda f: 5e-4 * jnp.sum(jnp.clip(f, -1.0, 1.0) ** 2),
-        ),
-        "humanoid": Task(
-            gymnasium_id="Humanoid-v5",
-            xml=ASSETS / "humanoid.xml",
-            frame_skip=5,
-            solver_iterations=4,
-            forward_reward=1.25,
-            control_cost=0.1,
-            healthy_reward=5.0,
-            healthy_z=(1.0, 2.0),
-            z_index=2,
-            reset_noise=1e-2,
-            hidden_positions=2,
-            fields=("xipos", "cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
-            position=_mass_centre,
-            observe_more=_body_observations,
-            contact_cost=_impact_cost,
-        ),
-        "humanoidstandup": Task(
-            gymnasium_id="HumanoidStandup-v5",
-            xml=ASSETS / "humanoidstandup.xml",
-            frame_skip=5,
-            solver_iterations=8,
-            forward_reward=0.0,
-            control_cost=0.1,
-            healthy_reward=1.0,
-            reset_noise=1e-2,
-            hidden_positions=2,
-            fields=("cinert", "cvel", "qfrc_actuator", "cfrc_ext"),
-            observe_more=_body_observations,
-            contact_cost=_impact_cost,
-            # The height over the duration of a time step.
-            reward=lambda before, after, fields, action: after.qpos[2] / 0.003,
-        ),
-        "inverted_pendulum": Task(
-            gymnasium_id="InvertedPendulum-v5",
-            xml=ASSETS / "inverted_pendulum.xml",
-            frame_skip=2,
-            forward_reward=0.0,
-            control_cost=0.0,
-            healthy_reward=1.0,
-            reset_noise=1e-2,
-            hidden_positions=0,
-            healthy=lambda state, fields: jnp.abs(state.qpos[1]) <= 0.2,
-        ),
-        "inverted_double_pendulum": Task(
-            gymnasium_id="InvertedDoublePendulum-v5",
-            xml=ASSETS / "inverted_double_pendulum.xml",
-            frame_skip=5,
-            forward_reward=0.0,
-            control_cost=0.0,
-            healthy_reward=10.0,
-            reset_noise=0.1,
-            normal_velocity_noise=True,
-            fields=("xpos", "xipos", "qfrc_constraint"),
-            observe=_observe_poles,
-            reward=_reward_of_poles,
-            healthy=lambda state, fields: _tip(fields)[2] > 1.0,
-        ),
-        "reacher": Task(
-            gymnasium_id="Reacher-v5",
-            xml=ASSETS / "reacher.xml",
-            frame_skip=2,
-            forward_reward=0.0,
-            control_cost=1.0,
-            fields=("xpos",),
-            observe=_observe_reacher,
-            reward=lambda before, after, fields, action: (
-                -jnp.linalg.norm(_to_target(fields))
-            ),
-            start=_start_of_reacher,
-            episode_length=50,
-        ),
-        "pusher": Task(
-            gymnasium_id="Pusher-v5",
-            xml=ASSETS / "pusher_v5.xml",
-            frame_skip=5,
-            forward_reward=0.0,
-            control_cost=0.1,
-            fields=("xpos",),
-            observe=_observe_pusher,
-            reward=_reward_of_pusher,
-            start=_start_of_pusher,
-            episode_length=100,
-        ),
-    }
-)
+        start=_start_of_reacher,
+        episode_length=50,
+    ),
+    "pusher": Task(
+        gymnasium_id="Pusher-v5",
+        xml=ASSETS / "pusher_v5.xml",
+        frame_skip=5,
+        forward_reward=0.0,
+        control_cost=0.1,
+        fields=("xpos",),
+        observe=_observe_pusher,
+        reward=_reward_of_pusher,
+        start=_start_of_pusher,
+        episode_length=100,
+    ),
+}
 
 
 class LocomotionState(struct.PyTreeNode):
@@ -374,26 +371,21 @@ class LocomotionState(struct.PyTreeNode):
 #: Physics engines by name: (model, fields, iterations, ls_iterations) -> `Physics`.
 PHYSICS: Mapping[
     str, Callable[[mujoco.MjModel, tuple[str, ...], int | None, int | None], Physics]
-] = types.MappingProxyType(
-    {
-        "jax": ours_or_mjx,
-        "mjx": MjxPhysics,
-        "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
-    }
-)
+] = {
+    "jax": ours_or_mjx,
+    "mjx": MjxPhysics,
+    "mujoco": lambda model, fields, *_: MujocoPhysics(model, fields),
+}
 
 #: Integrators by name; "model" is the integrator that the model specifies.
-INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = types.MappingProxyType(
-    {"model": None, "euler": mujoco.mjtIntegrator.mjINT_EULER}
-)
+INTEGRATORS: Mapping[str, mujoco.mjtIntegrator | None] = {
+    "model": None,
+    "euler": mujoco.mjtIntegrator.mjINT_EULER,
+}
 
 
 def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
-    """Return the model in a file or an XML text.
-
-    Raises:
-      ValueError: if MuJoCo can't load it; its message is joined into one line.
-    """
+    """Return the model in a file or an XML text; refuse it in one line."""
     is_text = str(xml).lstrip().startswith("<")
     load = mujoco.MjModel.from_xml_string if is_text else mujoco.MjModel.from_xml_path
     try:
@@ -404,22 +396,18 @@ def _load(xml: str | pathlib.Path) -> mujoco.MjModel:
 
 
 def _start(task: Task, model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Return qpos and qvel of a task's keyframe, or of its model's rest.
-
-    Raises:
-      ValueError: if the model has no such keyframe.
-    """
+    """Return qpos and qvel of a task's keyframe, or of its model's rest."""
     if task.keyframe is None:
         return model.qpos0, np.zeros(model.nv)
-    names = [model.key(i).name for i in range(model.nkey)]
-    if task.keyframe in names:
-        number = names.index(task.keyframe)
-    elif isinstance(task.keyframe, int) and task.keyframe in range(model.nkey):
-        number = task.keyframe
-    else:
-        listed = ", ".join(names) or "none: the model has no keyframes"
-        raise ValueError(f"keyframe is {task.keyframe!r}: it must be one of {listed}")
-    return model.key_qpos[number], model.key_qvel[number]
+    try:
+        keyframe = model.key(task.keyframe)
+    except (KeyError, IndexError):
+        names = ", ".join(model.key(i).name for i in range(model.nkey))
+        raise ValueError(
+            f"keyframe is {task.keyframe!r}: it must be one of "
+            f"{names or 'none: the model has no keyframes'}"
+        ) from None
+    return keyframe.qpos, keyframe.qvel
 
 
 def _with_unit_quaternions(model: mujoco.MjModel, qpos: jax.Array) -> jax.Array:
@@ -498,18 +486,10 @@ class Locomotion(Env):
         or "mujoco", in C on the host's cores.
       integrator: "model", the same as Gymnasium's, or "euler", which changes the task
         and needs a quarter of the evaluations if the model specifies Runge-Kutta.
-
-    Raises:
-      ValueError: if the model can't be loaded or does not fit the task, if the physics
-        lacks a part of it, or if a name is unknown.
     """
 
     def __init__(
-        self,
-        task: str | Task,
-        *,
-        physics: str = "jax",
-        integrator: str = "model",
+        self, task: str | Task, *, physics: str = "jax", integrator: str = "model"
     ):
         for what, name, names in (
             ("task", task, TASKS),
@@ -533,39 +513,17 @@ class Locomotion(Env):
         # A NumPy array becomes a constant of the traced functions.
         qpos, qvel = _start(task, self.model)
         self._start, self._start_velocity = np.float32(qpos), np.float32(qvel)
-        self._observation_size = jax.eval_shape(self.reset, jax.random.key(0)).obs.shape
-
-    @property
-    def episode_length(self) -> int:
-        """Number of steps after which an episode is truncated."""
-        return self.task.episode_length
+        self.episode_length, self.action_size = task.episode_length, self.model.nu
+        self.action_range = tuple(self.model.actuator_ctrlrange.T.astype(np.float32))
+        self.backend = self.physics.name
+        first = jax.eval_shape(self.reset, jax.random.key(0))
+        self.observation_size = first.obs.shape[0]
 
     @property
     def ends_early(self) -> bool:
         """Whether an episode can end before its step limit."""
         bounds = (self.task.healthy_z, self.task.healthy_angle, self.task.healthy_state)
         return self.task.healthy is not None or any(x != _EVERYTHING for x in bounds)
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return self._observation_size[0]
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector: the number of actuators."""
-        return self.model.nu
-
-    @property
-    def action_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest control, float32 (action,) each."""
-        low, high = self.model.actuator_ctrlrange.T.astype(np.float32)
-        return low, high
-
-    @property
-    def backend(self) -> str:
-        """The name of the physics engine that steps the model."""
-        return self.physics.name
 
     def reset(self, rng: jax.Array) -> State:
         """Start as the task says, or at rest with noise on positions and velocities."""
@@ -589,7 +547,7 @@ class Locomotion(Env):
 
     def state_at(self, qpos: jax.Array, qvel: jax.Array) -> State:
         """Return the state of an episode that starts at qpos (nq,) and qvel (nv,)."""
-        physics = self.physics.init(qpos, qvel)
+        physics = PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
         fields = self.physics.kinematics(physics)
         zero = jnp.float32(0)
         return State(
@@ -601,7 +559,6 @@ class Locomotion(Env):
         )
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Advance `frame_skip` physics steps under one action."""
         task, before = self.task, state.pipeline_state
         physics, fields = self.physics.step(before.physics, action, task.frame_skip)
         position = self._position(physics, fields)

@@ -16,22 +16,6 @@ with contextlib.redirect_stdout(io.StringIO()):
 from gasil_envs.base import Wrapper
 
 
-class _OfBrax(Wrapper):
-    """An environment of Brax that keeps the size of its observations.
-
-    Brax runs a reset, operation by operation, each time that it is asked for the size.
-    """
-
-    def __init__(self, env: Any, observation_size: int):
-        super().__init__(env)
-        self._observation_size = observation_size
-
-    @property
-    def observation_size(self) -> int:
-        """The number of numbers in an observation."""
-        return self._observation_size
-
-
 def names() -> tuple[str, ...]:
     """Return the names of Brax's environments."""
     return tuple(brax.envs._envs)
@@ -45,7 +29,10 @@ def build(name: str) -> Any:
         env.draw = functools.partial(_draw, env.sys)
     state = jax.eval_shape(env.reset, jax.random.key(0))
     jax.eval_shape(env.step, state, jnp.zeros(env.action_size))
-    return _OfBrax(env, state.obs.shape[-1])
+    env = Wrapper(env)
+    # Brax runs a reset, operation by operation, each time that it is asked for this.
+    env.observation_size = state.obs.shape[-1]
+    return env
 
 
 def _draw(system: Any, state: Any, size: tuple[int, int]) -> np.ndarray:

@@ -27,14 +27,7 @@ def names() -> tuple[str, ...]:
 
 
 def build(name: str) -> World:
-    """Build an environment of gymnax.
-
-    Args:
-      name: one of `names`; if observations have several parts, NAME:PART.
-
-    Raises:
-      Unfit: if actions are neither a box nor discrete, or if it needs a download.
-    """
+    """Build NAME, or NAME:PART if observations have several parts."""
     bare, _, part = name.partition(":")
     if bare in _DOWNLOADING:
         raise Unfit("downloads data when it is built, which is not supported")

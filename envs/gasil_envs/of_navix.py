@@ -17,11 +17,7 @@ def names() -> tuple[str, ...]:
 
 
 def build(name: str) -> World:
-    """Build an environment of navix, with its default observation of the whole grid.
-
-    Args:
-      name: one of `names`.
-    """
+    """Build one of `names`, with its default observation of the whole grid."""
     bare, _, part = name.partition(":")
     env = navix.make(bare)
 

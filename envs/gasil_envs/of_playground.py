@@ -23,14 +23,7 @@ def names() -> tuple[str, ...]:
 
 
 def build(name: str) -> World:
-    """Build a task of Playground, with MJX in JAX as its physics.
-
-    Args:
-      name: one of `names`; if observations have several parts, NAME:PART.
-
-    Raises:
-      Unfit: if it needs a download.
-    """
+    """Build NAME, or NAME:PART if observations have several parts; MJX steps it."""
     bare, _, part = name.partition(":")
     if bare not in dm_control_suite.ALL_ENVS:
         raise Unfit(

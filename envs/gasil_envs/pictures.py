@@ -28,12 +28,7 @@ class NoOpenGL(RuntimeError):
 class LocomotionPainter:
     """Draws states of locomotion off screen; close it after use.
 
-    Args:
-      env: the task, without wrappers.
-      size: width and height of a picture in pixels.
-
-    Raises:
-      NoOpenGL: if MuJoCo finds no OpenGL.
+    `size` is the width and height of a picture in pixels, here and below.
     """
 
     def __init__(self, env: Locomotion, size: tuple[int, int]):
@@ -92,21 +87,42 @@ class LocomotionPainter:
             scene.ngeom += 1
 
     def moment(self, step: int) -> str:
-        """Return the time of a step as the label of its picture."""
+        """Return the label of a step's picture."""
         return f"{step * self.seconds_per_step:.2f} s"
 
     def close(self) -> None:
-        """Free the OpenGL context."""
         self._renderer.close()
 
 
-class PointMassPainter:
-    """Draws the point mass, its objects and its path.
+class OwnPainter:
+    """Draws states of an environment that has a function `draw`."""
 
-    Args:
-      env: the point mass, without wrappers.
-      size: width and height of a picture in pixels.
-    """
+    def __init__(self, env: Any, size: tuple[int, int]):
+        self._env, self._size = env, size
+        self.seconds_per_step = float(getattr(env, "dt", 0.1))
+
+    def draw(self, episode: Sequence[Any]) -> np.ndarray:
+        """Return a picture of the last state, uint8 (height, width, 3)."""
+        name = type(self._env).__name__
+        with user_code.refused(f"draw of {name} fails"):
+            picture = np.asarray(self._env.draw(episode[-1], self._size))
+        shape = (self._size[1], self._size[0], 3)
+        if picture.shape != shape or picture.dtype != np.uint8:
+            given = f"{picture.dtype}{list(picture.shape)}"
+            raise ValueError(
+                f"draw of {name} returns {given}: it must be uint8{list(shape)}"
+            )
+        return picture
+
+    def moment(self, step: int) -> str:
+        return f"step {step}"
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to free."""
+
+
+class PointMassPainter(OwnPainter):
+    """Draws the point mass, its objects and its path."""
 
     seconds_per_step = 0.1
 
@@ -131,52 +147,8 @@ class PointMassPainter:
         self._canvas.draw()
         return np.asarray(self._canvas.buffer_rgba())[..., :3].copy()
 
-    def moment(self, step: int) -> str:
-        """Return the number of a step as the label of its picture."""
-        return f"step {step}"
 
-    def close(self) -> None:
-        """Do nothing: there is nothing to free."""
-
-
-class OwnPainter:
-    """Draws states of an environment that has a function `draw`.
-
-    Args:
-      env: the environment, without wrappers.
-      size: width and height of a picture in pixels.
-
-    Raises:
-      ValueError: from `draw`, if the environment's own fails, or if a picture is no
-        uint8 (height, width, 3).
-    """
-
-    def __init__(self, env: Any, size: tuple[int, int]):
-        self._env, self._size = env, size
-        self.seconds_per_step = float(getattr(env, "dt", 0.1))
-
-    def draw(self, episode: Sequence[Any]) -> np.ndarray:
-        """Return a picture of the last state, uint8 (height, width, 3)."""
-        name = type(self._env).__name__
-        with user_code.refused(f"draw of {name} fails"):
-            picture = np.asarray(self._env.draw(episode[-1], self._size))
-        shape = (self._size[1], self._size[0], 3)
-        if picture.shape != shape or picture.dtype != np.uint8:
-            given = f"{picture.dtype}{list(picture.shape)}"
-            raise ValueError(
-                f"draw of {name} returns {given}: it must be uint8{list(shape)}"
-            )
-        return picture
-
-    def moment(self, step: int) -> str:
-        """Return the number of a step as the label of its picture."""
-        return f"step {step}"
-
-    def close(self) -> None:
-        """Do nothing: there is nothing to free."""
-
-
-Painter = LocomotionPainter | PointMassPainter | OwnPainter
+Painter = LocomotionPainter | OwnPainter
 
 
 def can_draw(env: Env) -> bool:
@@ -186,12 +158,7 @@ def can_draw(env: Env) -> bool:
 
 
 def painter(env: Env, size: tuple[int, int]) -> Painter:
-    """Return the painter of an environment, wrapped or not.
-
-    Raises:
-      NoOpenGL: if the environment is a locomotion task and MuJoCo finds no OpenGL.
-      ValueError: if it can't be drawn.
-    """
+    """Return the painter of an environment, wrapped or not."""
     if isinstance(env.unwrapped, Locomotion):
         return LocomotionPainter(env.unwrapped, size)
     if isinstance(env.unwrapped, PointMass):

@@ -63,6 +63,8 @@ class PointMass(Env):
     """
 
     ends_early = False
+    action_size = 2
+    backend = "none"  # Of physics, which Brax's `Env` names.
 
     def __init__(self, layout: Layout | None = None):
         self.layout = layout = layout or Layout()
@@ -75,21 +77,7 @@ class PointMass(Env):
             np.float32,
         )
         self.episode_length = layout.episode_length
-
-    @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return 2 + self.objects.shape[0]
-
-    @property
-    def action_size(self) -> int:
-        """Length of the action vector."""
-        return 2
-
-    @property
-    def backend(self) -> str:
-        """The name of the physics engine, which Brax's `Env` requires: "none"."""
-        return "none"
+        self.observation_size = 2 + len(self.objects)
 
     def reset(self, rng: jax.Array) -> State:
         """Start near `Layout.start` with every object in place."""

@@ -2,17 +2,14 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, TypeVar, cast
 
 import jax
 
-Arguments = ParamSpec("Arguments")
-Result = TypeVar("Result")
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def full_precision(
-    function: Callable[Arguments, Result],
-) -> Callable[Arguments, Result]:
+def full_precision(function: Function) -> Function:
     """Make a function's traced matrix products use full float32.
 
     GPUs from Ampere on use TF32 by default, whose fraction has ten bits; PPO runs have
@@ -21,11 +18,11 @@ def full_precision(
     """
 
     @functools.wraps(function)
-    def traced(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+    def traced(*args: Any, **kwargs: Any) -> Any:
         config: Any = jax.config  # Its type does not declare the options.
         if config.jax_default_matmul_precision is not None:
             return function(*args, **kwargs)
         with jax.default_matmul_precision("highest"):
             return function(*args, **kwargs)
 
-    return traced
+    return cast(Function, traced)

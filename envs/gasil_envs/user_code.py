@@ -12,15 +12,7 @@ import jax
 
 
 def find(kind: str, name: str) -> Any:
-    """Return the object that MODULE:NAME names.
-
-    Args:
-      kind: what the object is, for the error message, such as "env".
-      name: MODULE:NAME.
-
-    Raises:
-      ValueError: if it can't be imported.
-    """
+    """Return the object that MODULE:NAME names; `kind` is what it is, such as "env"."""
     module, attribute = name.split(":", 1)
     with refused(f"{kind} {name!r} can't be imported"):
         return getattr(importlib.import_module(module), attribute)
@@ -33,12 +25,9 @@ def refused(
     """Turn all that a user's code raises in the `with` block into a `ValueError`.
 
     That includes `SystemExit`, as of a script that ends with `sys.exit()`: the user's
-    code does not decide how this process ends. Only Ctrl-C does.
-
-    Args:
-      what: the beginning of the message, such as "agent 'a:B' can't be traced".
-      *packages: as in `in_a_line`.
-      passing: type of the errors that are raised as they are.
+    code does not decide how this process ends. Only Ctrl-C does. `what` begins the
+    message, such as "agent 'a:B' can't be traced", and errors of the type `passing` are
+    raised as they are.
     """
     try:
         yield
@@ -54,12 +43,9 @@ def refused(
 def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
     """Return an error as one line: its message, with type and place if they help.
 
-    The place is the innermost line of the user's own code, if the error passed any. The
-    type is left out of an error that explains itself without it.
-
-    Args:
-      error: the error.
-      *packages: folders of other packages, whose code is not the user's.
+    The place is the innermost line of the user's own code, if the error passed any:
+    that of other `packages`, which are folders, is not. The type is left out of an
+    error that explains itself without it.
     """
     message = str(error).partition("\n")[0]
     typed = ": ".join(filter(None, (type(error).__name__, message)))
@@ -77,9 +63,7 @@ def in_a_line(error: BaseException, *packages: pathlib.Path) -> str:
 def first_change(before: Any, after: Any) -> tuple[str, str, str] | None:
     """Return the first leaf of two pytrees of arrays whose dtype or shape differs.
 
-    Returns:
-      Its path and what it is in each, such as float32[3], or "missing"; None if all
-      leaves are the same.
+    It is a path and what is there in each, such as float32[3] or "missing"; or None.
     """
     described = [
         {

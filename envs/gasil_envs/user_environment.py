@@ -34,11 +34,7 @@ def missing(env: Any) -> str | None:
 
 
 def find(name: str) -> Callable[[], Env]:
-    """Return the class or function that MODULE:NAME names.
-
-    Raises:
-      ValueError: if it can't be imported or needs arguments.
-    """
+    """Return the class or function that MODULE:NAME names."""
     constructor = user_code.find("env", name)
     try:
         inspect.signature(constructor).bind()
@@ -53,9 +49,6 @@ def build(name: str) -> Env:
     """Build and check the environment that MODULE:NAME names, without running it.
 
     If its actions are far from -1 to 1, it gets them in these units.
-
-    Raises:
-      ValueError: if it can't be built or does not have Brax's interface.
     """
     constructor = find(name)
     with user_code.refused(f"env {name!r} can't be built"):
@@ -79,17 +72,9 @@ def _is_scaled(env: Env) -> bool:
 
 
 def check(name: str, env: Any, trained: Any) -> None:
-    """Check the sizes and states of an environment, without running it.
+    """Refuse an environment with wrong sizes, or states of wrong structure or dtype.
 
-    Args:
-      name: name of the environment, for the error message.
-      env: an object with Brax's `reset`, `step`, `observation_size` and `action_size`,
-        or `num_actions` in place of the last.
-      trained: the environment that training steps: `env`, or a wrapper of it.
-
-    Raises:
-      ValueError: if a size is no count, or if a state has a wrong structure, shape or
-        dtype.
+    Nothing is run. `trained` is what training steps: `env`, or a wrapper of it.
     """
     size = "num_actions" if wrappers.is_discrete(env) else "action_size"
     if wrappers.is_discrete(env) and hasattr(env, "action_size"):
@@ -139,11 +124,7 @@ def _check_action_range(name: str, env: Env) -> None:
 
 
 def _traced(name: str, env: Env, function: str, *arguments: Any) -> Any:
-    """Return the shapes of the state that an environment's function returns.
-
-    Raises:
-      ValueError: if it can't be traced, or returns something else than a state.
-    """
+    """Return the shapes of the state that an environment's function returns."""
 
     def called(*arguments: Any) -> Any:
         state = getattr(env, function)(*arguments)
@@ -179,17 +160,12 @@ def _check_states(name: str, env: Env, trained: Env) -> None:
     stepped = _traced(name, env, "step", bare, action)
     for state, where in ((bare, "reset"), (stepped, "step")):
         fields = {"obs": state.obs, "reward": state.reward, "done": state.done}
-        of_info = {
-            f"info[{x!r}]": state.info[x]
-            for x in ("truncation", "true_reward")
-            if x in state.info
-        }
+        names = {"truncation", "true_reward"} & {*state.info}
+        of_info = {f"info[{x!r}]": state.info[x] for x in sorted(names)}
         for field, value in (fields | of_info).items():
-            shape: tuple[int, ...] = ()
-            why = ""
-            if field == "obs":
-                shape = (size,)
-                why = f", as observation_size is {size}"
+            is_obs = field == "obs"
+            shape = (size,) if is_obs else ()
+            why = f", as observation_size is {size}" if is_obs else ""
             is_array = hasattr(value, "shape")
             if not is_array or value.shape != shape:
                 kind = type(value).__name__

@@ -6,11 +6,10 @@ Each family is a module with two functions: `names`, the names of its environmen
 environments is named.
 """
 
-import contextlib
 import importlib
 import importlib.metadata
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -38,40 +37,23 @@ def forms() -> tuple[str, ...]:
 
 
 def names(family: str) -> tuple[str, ...]:
-    """Return the names of a family's environments, with its prefix.
-
-    Raises:
-      ValueError: if its package is missing.
-    """
+    """Return the names of a family's environments, with its prefix."""
     module, package = FAMILIES[family]
-    with _imported(family, package), warnings.catch_warnings():
-        # Such packages warn of others that are absent.
-        warnings.simplefilter("ignore")
-        bare = importlib.import_module(module).names()
-    return tuple(f"{family}:{name}" for name in bare)
-
-
-@contextlib.contextmanager
-def _imported(family: str, package: str) -> Iterator[None]:
-    """Refuse a family whose package can't be imported, in one line."""
     try:
-        yield
+        with warnings.catch_warnings():
+            # Such packages warn of others that are absent.
+            warnings.simplefilter("ignore")
+            bare = importlib.import_module(module).names()
     except ImportError as error:
         raise ValueError(
             f"env {family}:NAME needs the package {package}: {error} (pip install "
             f'"gasil_jax[{family}]")'
         ) from None
+    return tuple(f"{family}:{name}" for name in bare)
 
 
 def build(name: str) -> Env:
-    """Build an environment of a family, and trace its functions without running them.
-
-    Args:
-      name: one of `names`.
-
-    Raises:
-      ValueError: if its package fails, or if it gives what can't be trained on.
-    """
+    """Build one of `names`, and trace its functions without running them."""
     family, bare = name.split(":", 1)
     module, package = FAMILIES[family]
     try:
@@ -110,9 +92,6 @@ class World:
         shape is that of an action.
       episode_length: number of steps after which an episode is truncated.
       part: name of the part of the observation that is used, if that is a dict.
-
-    Raises:
-      Unfit: if the observation is no array.
     """
 
     #: Draws a state, where the other package can (see `pictures`).

@@ -34,13 +34,9 @@ def is_sound(x: jax.Array) -> jax.Array:
 def step_is_sound(observation: jax.Array, stepped: State) -> jax.Array:
     """Return whether the physics of a step is sound, bool (...).
 
-    The physics has failed if `is_sound` is false for any number in the observations
-    before and after the step, in the reward (given, true or held back), in ``done`` or
-    in the truncation.
-
-    Args:
-      observation: (..., obs), before the step.
-      stepped: the state after the step, (...).
+    It has failed if `is_sound` is false for any number in the observations before and
+    after it, in the reward (given, true or held back), in ``done`` or in the
+    truncation.
     """
     sound = is_sound(observation).all(axis=-1) & is_sound(stepped.obs).all(axis=-1)
     for number in (stepped.reward, stepped.done, *map(stepped.info.get, _OF_STEP)):
@@ -97,14 +93,12 @@ class ActionNoise(Wrapper):
         self._scale = scale
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode; `rng` also draws the noise of its steps."""
         env_key, key = jax.random.split(rng)
         state = self.env.reset(env_key)
         _refuse_taken(state, "action_noise_key")
         return state.replace(info={**state.info, "action_noise_key": key})
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Add noise to the action, then take a step."""
         key, first, second = jax.random.split(state.info["action_noise_key"], 3)
         if is_discrete(self.env):
             other = jax.random.randint(first, (), 0, self.env.num_actions)
@@ -133,7 +127,6 @@ class UnitActions(Wrapper):
         self._middle, self._half = 0.5 * (high + low), 0.5 * (high - low)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Take a step with the action in the environment's own units."""
         return self.env.step(state, self._middle + self._half * action)
 
 
@@ -159,14 +152,12 @@ class EpisodeLimit(Wrapper):
         return getattr(self.env, "unwrapped", self.env)
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode."""
         state = self.env.reset(rng)
         _refuse_taken(state, "steps")
         info = {**state.info, "steps": jnp.int32(0), "truncation": jnp.float32(0)}
         return state.replace(done=jnp.zeros_like(state.done), info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and set ``done`` and ``truncation`` at the limit."""
         steps = state.info["steps"] + 1
         # An environment without truncation must not keep the last step's value.
         info = {**state.info, "truncation": jnp.float32(0)}
@@ -200,7 +191,6 @@ class RewardDelay(Wrapper):
         return state.info["true_reward"] if self._gives_true_reward else state.reward
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode with nothing held back."""
         state = self.env.reset(rng)
         info = {
             **state.info,
@@ -211,7 +201,6 @@ class RewardDelay(Wrapper):
         return state.replace(info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and hold back or give the reward."""
         held, steps = state.info["held_reward"], state.info["delay_steps"] + 1
         state = self.env.step(state, action)
         held = held + state.reward
@@ -234,7 +223,6 @@ class DelayPhase(Wrapper):
 
     @property
     def observation_size(self) -> int:
-        """The number of numbers in an observation."""
         return self.env.observation_size + 1
 
     def _with_phase(self, state: State) -> State:
@@ -243,12 +231,10 @@ class DelayPhase(Wrapper):
         return state.replace(obs=jnp.append(state.obs, phase))
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode with phase 0."""
         return self._with_phase(self.env.reset(rng))
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and add the phase; the environment gets its own observation."""
-        state = state.replace(obs=state.obs[:-1])
+        state = state.replace(obs=state.obs[:-1])  # The environment's own.
         return self._with_phase(self.env.step(state, action))
 
 
@@ -271,14 +257,12 @@ class ObservationNoise(Wrapper):
         )
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode; `rng` is split between the environment and the noise."""
         env_key, noise_key = jax.random.split(rng)
         state = self.env.reset(env_key)
         _refuse_taken(state, "noise_key", "true_observation")
         return self._noisy(state, noise_key)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and add fresh noise to the observation."""
         noise_key = state.info["noise_key"]
         # An environment may use its last observation, so it gets the one without noise.
         state = state.replace(obs=state.info["true_observation"])
@@ -288,11 +272,10 @@ class ObservationNoise(Wrapper):
 class FaultyStepEnds(Wrapper):
     """End an episode in which the physics fails; for use with other libraries.
 
-    The physics fails if an observation or a reward is not `is_sound`. The step then has
-    reward 0 and the observation of the step before. If the first observation of an
-    episode is not sound, it is replaced by zeros, and the episode ends with its first
-    step. The rollout of `gasil_jax` does the same, but there the observation after a
-    failed step is zeros.
+    The step has reward 0 and the observation of the step before. If an episode's first
+    observation is not sound, it is zeros, and the episode ends with its first step. The
+    rollout of `gasil_jax` does the same, but there the observation after a failed step
+    is zeros.
     """
 
     def reset(self, rng: jax.Array) -> State:
@@ -304,7 +287,6 @@ class FaultyStepEnds(Wrapper):
         return state.replace(obs=jnp.where(sound, state.obs, 0.0), info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and terminate the episode if the physics fails."""
         stepped = self.env.step(state, action)
         sound = step_is_sound(state.obs, stepped) & ~state.info["unsound_start"]
 
@@ -330,14 +312,12 @@ class AutoReset(Wrapper):
     """
 
     def reset(self, rng: jax.Array) -> State:
-        """Start an episode; `rng` also draws the later starts."""
         key, reset_key = jax.random.split(rng)
         state = self.env.reset(reset_key)
         info = {**state.info, "reset_key": key, "final_observation": state.obs}
         return state.replace(info=info)
 
     def step(self, state: State, action: jax.Array) -> State:
-        """Step, and replace an ended episode's state by a fresh start."""
         key, reset_key = jax.random.split(state.info["reset_key"])
         info = dict(state.info)
         del info["reset_key"], info["final_observation"]

@@ -108,15 +108,12 @@ def test_it_learns_on_the_point_mass(agent):
     assert np.all(returns[:, -3:].mean(1) > 15.0)
 
 
-def halved(agent, names):
-    """Changes that halve an agent's numbers."""
-    return {name: 0.5 * ALGORITHMS[agent].hyperparameters[name] for name in names}
-
-
 @pytest.mark.parametrize("agent", each(x for x in SELF_TAUGHT if traced_names(x)))
 def test_an_agent_looks_at_each_of_its_numbers(agent):
-    for name in traced_names(ALGORITHMS[agent].agent):
-        state, _ = train(agent, 2, changes=({}, halved(agent, [name])))
+    algorithm = ALGORITHMS[agent]
+    for name in traced_names(algorithm.agent):
+        half = {name: 0.5 * algorithm.hyperparameters[name]}
+        state, _ = train(agent, 2, changes=({}, half))
         kernel = np.asarray(jax.tree.leaves(state.actor_critic)[0])
         assert (kernel[0] != kernel[1]).any(), name
 
@@ -172,7 +169,6 @@ def test_cloning_makes_the_good_steps_likelier():
         params = gasil_jax.member(states, i).actor_critic.policy.params
         gaussian = network.apply(params, observation)
         losses.append(-float(jnp.mean(GAUSSIAN.log_prob(gaussian, good.action[:100]))))
-    print("losses:", losses)
     assert losses[0] < losses[1] - 0.01
     # Without weight it is PPO. Adam's momentum still acts on the policy, so that only
     # the value, which cloning leaves alone, is equal.

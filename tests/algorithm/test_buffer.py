@@ -36,16 +36,10 @@ class ListBuffer:
 
 
 @functools.partial(jax.jit, static_argnames="max_episodes")
-def push(buffer, history, observation, ended, return_, length, max_episodes=None):
-    batch = types.SimpleNamespace(
-        observation=observation,
-        action=-observation,
-        reward=jnp.zeros_like(return_),
-        ended=ended,
-        faulty=False,
-        cut_short=False,
-    )
-    history = rollout.record(history, batch)
+def push(buffer, history, observation, ended, return_, length, max_episodes):
+    steps = {"observation": observation, "action": -observation, "ended": ended}
+    never = {"reward": jnp.zeros_like(return_), "faulty": False, "cut_short": False}
+    history = rollout.record(history, types.SimpleNamespace(**steps, **never))
     buffer = good_trajectories.insert(
         buffer, history, ended, return_, length=length, max_episodes=max_episodes
     )
@@ -53,26 +47,17 @@ def push(buffer, history, observation, ended, return_, length, max_episodes=None
 
 
 def empty():
-    return (
-        good_trajectories.init_buffer(CAPACITY, 1, 1),
-        rollout.init_history(
-            NUM_ENVS, NUM_STEPS, MAX_EPISODE, observation_size=1, action_size=1
-        ),
-    )
+    sizes = {"observation_size": 1, "action_size": 1}
+    history = rollout.init_history(NUM_ENVS, NUM_STEPS, MAX_EPISODE, **sizes)
+    return good_trajectories.init_buffer(CAPACITY, 1, 1), history
 
 
 step = st.tuples(
     st.booleans(), st.sampled_from([-2.0, 0.0, 1.0, 1.5, float("nan"), float("inf")])
 )
-batches = st.lists(
-    st.lists(
-        st.lists(step, min_size=NUM_ENVS, max_size=NUM_ENVS),
-        min_size=NUM_STEPS,
-        max_size=NUM_STEPS,
-    ),
-    min_size=1,
-    max_size=6,
-)
+row = st.lists(step, min_size=NUM_ENVS, max_size=NUM_ENVS)
+batch = st.lists(row, min_size=NUM_STEPS, max_size=NUM_STEPS)
+batches = st.lists(batch, min_size=1, max_size=6)
 
 
 def replay(batches, max_episodes=None):
@@ -98,13 +83,7 @@ def replay(batches, max_episodes=None):
                     reference.insert(value, running[env])
                     running[env] = []
         buffer, history = push(
-            buffer,
-            history,
-            observation,
-            ended,
-            return_,
-            length,
-            max_episodes=max_episodes,
+            buffer, history, observation, ended, return_, length, max_episodes
         )
     return jax.tree.map(np.asarray, buffer), reference
 

@@ -1,6 +1,5 @@
 """Every agent with discrete actions, and what a run of one leaves behind."""
 
-import functools
 import pathlib
 
 import gymnasium
@@ -18,14 +17,11 @@ from gasil_jax import (
     evaluate,
     evaluation,
     normalization,
-    numpy_policy,
-    plot,
-    policy,
     render,
     run,
 )
-from gasil_jax.host import policy_file, saved
-from gasil_jax.networks import CategoricalPolicy, Discriminator
+from gasil_jax.host import saved
+from gasil_jax.networks import Discriminator
 
 SETTINGS = {
     "total_steps": 20 * 256,
@@ -38,11 +34,10 @@ SETTINGS = {
     "gamma": 0.9,
     "entropy_coefficient": 0.01,
 }
-SMALL = {
+DISCRIMINATOR = {
     "discriminator_hidden_sizes": (16,),
     "discriminator_learning_rate": 1e-2,
     "discriminator_updates": 20,
-    "buffer_steps": 200,
 }
 
 
@@ -55,27 +50,16 @@ def expert(tmp_path_factory):
     return str(path)
 
 
-@functools.cache
-def train(agent, seeds=2, **changes):
-    """The environment, algorithm, states and metrics of a short training."""
-    env = gasil_jax.make_env("corridor:Corridor")
-    changes = {**SETTINGS, **changes}
-    algorithm = gasil_jax.algorithm(agent)
-    known = {x: y for x, y in SMALL.items() if x in algorithm.settings}
-    algorithm = algorithm.replace(**known, **changes)
-    keys = jax.vmap(jax.random.key)(np.arange(seeds))
-    learn = jax.jit(jax.vmap(gasil_jax.make_train(env, algorithm)))
-    return env, algorithm, *learn(keys)
-
-
 # The others use nothing of an action that one of these does not. GAIL's discriminator
 # is that of PPO+GASIL, which is trained below.
 @pytest.mark.parametrize("agent", ["ppo+sil", "gail"])
 def test_agents_learn(agent, expert):
-    more = {"expert": expert} if agent == "gail" else {}
-    env, algorithm, states, metrics = train(agent, **more)
+    env = gasil_jax.make_env("corridor:Corridor")
+    more = {**DISCRIMINATOR, "expert": expert} if agent == "gail" else {}
+    algorithm = gasil_jax.algorithm(agent, **SETTINGS, **more)
+    fitted = gasil_jax.fit(env, algorithm, seeds=2)
+    states, metrics = fitted.states, fitted.metrics
     returns = np.nan_to_num(metrics["episode_return"], nan=-1.0)
-    print(agent, returns.round(2).tolist())
     assert (returns[:, -3:].mean(axis=1) > returns[:, :2].mean(axis=1) + 3.0).all()
     # Evaluations take the most probable action.
     score = jax.vmap(
@@ -86,34 +70,6 @@ def test_agents_learn(agent, expert):
     assert (score["episode_return"] > 17.0).all()
     assert (metrics["entropy"] <= np.log(3) + 1e-5).all()
     assert (metrics["entropy"][:, -1] < metrics["entropy"][:, 0]).all()
-
-
-def test_a_saved_policy_acts_as_the_network(tmp_path):
-    env, _, states, _ = train("ppo+sil")
-    path = tmp_path / "policy.npz"
-    policy_file.save(path, states, env, [3, 4], np.array([1.0, 2.0]))
-    state, observation = gasil_jax.member(states, 1), np.eye(LENGTH, dtype=np.float32)
-    network = CategoricalPolicy(SETTINGS["hidden_sizes"], 3)
-    logits = jax.jit(
-        lambda state: network.apply(
-            state.actor_critic.policy.params,
-            normalization.normalize(state.normalizer, observation),
-        )
-    )(state)
-    act, in_numpy = gasil_jax.load_policy(path), numpy_policy.load(path)
-    for action in (act(observation), jax.vmap(act)(observation), in_numpy(observation)):
-        np.testing.assert_array_equal(action, logits.argmax(axis=1))
-        assert action.dtype == np.int32
-    weights = numpy_policy.read(path, 4)
-    # Both draw by probability, of an observation for which none is near 1.
-    weights["kernel_1"] = 0.1 * weights["kernel_1"]
-    expected = jax.nn.softmax(numpy_policy.output(weights, observation[0]))
-    assert expected.max() < 0.9
-    many = np.tile(observation[0], (20_000, 1))
-    drawn = numpy_policy.make(weights)(many, np.random.default_rng(0))
-    np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
-    drawn = policy.make(weights)(many, jax.random.key(0))
-    np.testing.assert_allclose(np.bincount(drawn) / 20_000, expected, atol=0.015)
 
 
 FLAGS = (
@@ -128,7 +84,7 @@ FLAGS = (
 def finished(tmp_path_factory):
     """A run with delayed rewards and noise."""
     out = str(tmp_path_factory.mktemp("discrete") / "run")
-    more = ("--seeds", "2", "--evaluate-every", "512", "--initial-std", "0.5")
+    more = ("--seeds", "2", "--initial-std", "0.5")
     assert run.main([*FLAGS, *more, "--total-steps", "1024", "--out", out]) == 0
     return out
 
@@ -142,7 +98,6 @@ def test_a_run_from_end_to_end(finished, tmp_path, capsys):
     film = tmp_path / "film.png"
     assert render.main([finished, "--out", str(film), "--width", "80"]) == 0
     assert film.stat().st_size
-    assert plot.main([finished, "--out", str(tmp_path / "curve.png")]) == 0
 
 
 def test_the_discriminators_reward_is_that_of_its_formula(finished):

@@ -4,6 +4,7 @@ That it learns from one: test_discrete.py.
 """
 
 import sys
+from unittest import mock
 
 import gymnasium
 import jax
@@ -12,12 +13,15 @@ import numpy as np
 import pytest
 from minari.data_collector import EpisodeBuffer
 from refusals import refused
-from small_training import DISCRIMINATOR_FLAGS, FLAGS
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import run
 from gasil_jax.agents import expert as expert_module
+from gasil_jax.cli import options
 from gasil_jax.context import Sizes
+from gasil_jax.errors import InputError
+from gasil_jax.host import training
 from gasil_jax.host.members import make_members
 
 
@@ -107,16 +111,15 @@ def test_a_minari_data_set_is_an_expert(data_set, tmp_path, monkeypatch):
         assert "\n" not in str(refusal.value)
 
 
-def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys):
+def test_a_run_does_not_continue_with_another_expert(tmp_path, capsys, monkeypatch):
     path, out = tmp_path / "own.npz", tmp_path / "out"
     write_expert(path, 20)
     own = dict(np.load(path))
-    small = [*FLAGS, *DISCRIMINATOR_FLAGS, "--discriminator-updates", "1"]
-    command = [*small, "--agent", "gail", "--expert", str(path)]
-    assert run.main([*command, "--out", str(out)]) == 0
-    continued = ["--resume", "--out", str(out)]
-    np.savez(path, **{name: -x for name, x in own.items()})
-    told = refused(capsys, run, *continued, "--env", "point_mass")
-    assert "the trajectories of the expert were others" in told
-    np.savez(path, **own)
-    assert run.main(continued) == 0
+    out.mkdir()
+    words = [*FLAGS, "--agent", "gail", "--expert", str(path)]
+    options.read(options.Options, words, "x")[1].write(out)
+    continued = ["--resume", "--out", str(out), "--env", "point_mass"]
+    monkeypatch.setattr(training, "prepare", mock.Mock(side_effect=InputError("here")))
+    for sign, told in ((-1, "the trajectories of the expert were others"), (1, "here")):
+        np.savez(path, **{name: sign * x for name, x in own.items()})
+        assert told in refused(capsys, run, *continued)

@@ -1,6 +1,6 @@
-"""The installed JAX computes correct numbers."""
+"""The installed JAX computes correct numbers, and our permutations are its own."""
 
-import contextlib
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import pytest
 
 import gasil_jax
 from gasil_jax import policy
+from gasil_jax.permutation import argsort, permutation
 
 
 @pytest.mark.compiled_as_for_users
@@ -48,45 +49,27 @@ ALGORITHM = gasil_jax.algorithm(
 )
 
 
-def assert_close(compiled, eager):
-    plain = lambda x: (
-        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
-    )
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(
-            plain(a), plain(b), rtol=1e-4, atol=1e-5
-        ),
-        compiled,
-        eager,
-    )
-
-
 @pytest.mark.compiled_as_for_users
 def test_an_optimized_iteration_equals_a_plain_one():
     """Two of them: rollout, insertion, advantages, discriminator and PPO."""
     env = gasil_jax.make_env("point_mass", reward_delay=2, max_episode_steps=2)
     step = lambda state: gasil_jax.train_step(env, ALGORITHM, state)
-    with without_optimizations():  # Both begin with the same state.
-        first = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))(
-            jax.random.key(0)
-        )
-        plain = jax.jit(step).lower(first).compile()
-    optimized = jax.jit(step).lower(first).compile()
+    # As tests are compiled that have no mark; see conftest.py.
+    less = {"backend_optimization_level": 0, "llvm_disable_expensive_passes": True}
+    less = {f"xla_{name}": value for name, value in less.items()}
+    init = jax.jit(lambda key: gasil_jax.init(env, ALGORITHM, key))
+    first = init.lower(jax.random.key(0)).compile(less)(jax.random.key(0))
+    lowered = jax.jit(step).lower(first)
+    plain = lowered.compile(less)
+    optimized = lowered.compile()
     state, _ = plain(first)
     assert int(state.agent.buffer.size) == 3
-    assert_close(optimized(state), plain(state))
-
-
-@contextlib.contextmanager
-def without_optimizations():
-    """As tests are compiled that have no mark; see conftest.py."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-        jax.config.update("jax_disable_most_optimizations", True)
-        try:
-            yield
-        finally:
-            jax.config.update("jax_disable_most_optimizations", False)
+    number = lambda x: (
+        jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+    )
+    ours, theirs = (jax.tree.map(number, each(state)) for each in (optimized, plain))
+    close = functools.partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5)
+    jax.tree.map(close, ours, theirs)
 
 
 def products(jaxpr):
@@ -120,3 +103,17 @@ def test_matrices_are_multiplied_in_full_precision():
     with jax.default_matmul_precision("default"):
         jaxpr = jax.make_jaxpr(lambda x: gasil_jax.train_step(env, ALGORITHM, x))(state)
     assert (highest, highest) not in set(products(jaxpr.jaxpr))
+
+
+@pytest.mark.parametrize("size", [1, 7, 2048, 3000, 2**16 + 1])
+def test_the_order_is_that_of_jax(size):
+    key = jax.random.key(size)
+    ours = jax.jit(permutation, static_argnums=1)(key, size)
+    np.testing.assert_array_equal(ours, jax.random.permutation(key, size))
+    assert ours.dtype == jnp.int32
+
+
+@pytest.mark.parametrize("highest", [1, 3, 2**22, 2**32])
+def test_argsort_is_stable(highest):
+    keys = np.random.default_rng(0).integers(0, highest, 1000, dtype=np.uint32)
+    np.testing.assert_array_equal(argsort(keys), np.argsort(keys, kind="stable"))

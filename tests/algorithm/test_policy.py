@@ -4,72 +4,114 @@ import subprocess
 import sys
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from small_training import drawn_policies
+from test_distributions import softmax
 
 import gasil_jax
 from gasil_jax import normalization, numpy_policy, policy
 from gasil_jax.host import policy_file
-from gasil_jax.networks import GaussianPolicy
+from gasil_jax.networks import CategoricalPolicy, GaussianPolicy, MixturePolicy
+
+#: Tasks, and the policies' networks.
+KINDS = {
+    "gaussian": ("point_mass", GaussianPolicy((16, 8), 2)),
+    "mixture": ("point_mass", MixturePolicy((16, 8), 2, components=3)),
+    "categorical": ("corridor:Corridor", CategoricalPolicy((16, 8), 3)),
+}
+
+
+def save(folder, kind="gaussian"):
+    """Save three policies of a kind; return the environment and their states."""
+    env = gasil_jax.make_env(KINDS[kind][0], reward_delay=7)
+    components = 3 if kind == "mixture" else 1
+    algorithm = gasil_jax.algorithm(
+        "ppo", hidden_sizes=(16, 8), policy_components=components
+    )
+    states, final = drawn_policies(env, algorithm, 3), np.array([1, 3, np.nan])
+    policy_file.save(folder / "policy.npz", states, env, [5, 6, 7], final)
+    return env, states
 
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory):
-    env = gasil_jax.make_env("point_mass", reward_delay=7)
-    algorithm = gasil_jax.algorithm("ppo", hidden_sizes=(16, 8))
-    states = drawn_policies(env, algorithm, 3)
     folder = tmp_path_factory.mktemp("run")
-    policy_file.save(
-        folder / "policy.npz", states, env, [5, 6, 7], np.array([1, 3, np.nan])
-    )
-    return env, algorithm, states, folder
+    return *save(folder), folder
 
 
-@pytest.mark.parametrize("seed", [5, 6, 7, None])
-def test_it_is_the_networks_gaussian(saved, seed):
-    env, algorithm, states, folder = saved
-    network = GaussianPolicy(algorithm.config.hidden_sizes, env.action_size)
-
-    @jax.jit
-    def expected(params, normalizer, key):
-        observation = jax.random.normal(key, (9, env.observation_size))
-        # The last one is far beyond the clip.
-        observation = (3.0 * observation).at[-1].multiply(1e3)
-        normalized = normalization.normalize(normalizer, observation)
-        mean, log_std = network.apply(params, normalized)
-        noise = jnp.exp(log_std)[None] * jax.random.normal(key, mean.shape)
-        means, draws = (jnp.clip(x, -1.0, 1.0) for x in (mean, mean + noise))
-        return observation, normalized, means, draws
-
-    index = 1 if seed is None else seed - 5
+def parameters(kind, states, index, observation):
+    """What the network gives of one policy, in NumPy, and what it is given."""
     params, normalizer = jax.tree.map(
         lambda x: x[index], (states.actor_critic.policy.params, states.normalizer)
     )
-    key = jax.random.key(3)
-    observation, normalized, means, draws = expected(params, normalizer, key)
+    normalized = normalization.normalize(normalizer, observation)
+    given = jax.jit(KINDS[kind][1].apply)(params, normalized)
+    return jax.tree.map(lambda x: np.asarray(x, float), given), normalized
+
+
+@pytest.mark.parametrize("seed", [5, 7, None])
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_saved_policy_acts_as_its_network(kind, seed, tmp_path):
+    """Of no seed it is the best one's."""
+    env, states = save(tmp_path, kind)
+    observation = 3.0 * jax.random.normal(jax.random.key(3), (9, env.observation_size))
+    # The last one is far beyond the clip.
+    observation = observation.at[-1].multiply(1e3)
+    index = 1 if seed is None else seed - 5
+    given, normalized = parameters(kind, states, index, observation)
     assert np.abs(normalized).max() == numpy_policy.CLIP
-    act = gasil_jax.load_policy(folder, seed)
-    np.testing.assert_allclose(act(observation), means, atol=1e-5)
-    np.testing.assert_allclose(jax.jit(jax.vmap(act))(observation), means, atol=1e-5)
-    in_numpy = numpy_policy.load(folder / "policy.npz", seed)(np.asarray(observation))
-    assert in_numpy.dtype == np.float32
-    np.testing.assert_allclose(in_numpy, means, atol=1e-5)
-    np.testing.assert_allclose(act(observation, key), draws, atol=1e-5)
+    if kind == "categorical":
+        expected = given.argmax(axis=1)
+    else:
+        mean, *_, logits = given
+        chosen = logits.argmax(axis=1) if kind == "mixture" else ...
+        # Or the order of the output is not tested.
+        assert chosen is ... or len(set(chosen.tolist())) > 1
+        expected = mean if chosen is ... else mean[np.arange(9), chosen]
+        expected = np.clip(expected, -1.0, 1.0)
+    act = gasil_jax.load_policy(tmp_path, seed)
+    in_numpy = numpy_policy.load(tmp_path / "policy.npz", seed)
+    actions = act(observation), jax.jit(jax.vmap(act))(observation)
+    for action in (*actions, in_numpy(np.asarray(observation))):
+        np.testing.assert_allclose(action, expected, atol=1e-5)
+        assert action.dtype == (np.int32 if kind == "categorical" else np.float32)
+    one = in_numpy(np.asarray(observation[3]))
+    np.testing.assert_allclose(one, expected[3], atol=1e-5)
 
 
-def test_draws_in_numpy_have_the_policys_spread(saved):
-    env, _, _, folder = saved
-    weights = numpy_policy.read(folder, 5)
-    weights["low"], weights["high"] = -100 * np.ones(2), 100 * np.ones(2)
-    observation = np.zeros((20_000, env.observation_size), np.float32)
-    draws = numpy_policy.make(weights)(observation, np.random.default_rng(0))
-    np.testing.assert_allclose(draws.std(axis=0), np.exp(weights["log_std"]), rtol=0.05)
+@pytest.mark.parametrize("kind", KINDS)
+def test_draws_in_jax_and_in_numpy_are_of_the_policys_distribution(kind, tmp_path):
+    env, states = save(tmp_path, kind)
+    weights, observation = numpy_policy.read(tmp_path, 5), np.ones(env.observation_size)
+    # Here without the clip.
+    weights |= {"low": np.full(2, -99.0), "high": np.full(2, 99.0)}
+    given, _ = parameters(kind, states, 0, observation)
+    if kind == "categorical":
+        center, deviation = softmax(given), 0.0
+        assert center.max() < 0.9
+    else:
+        # A Gaussian is a mixture of one.
+        mean, log_std, *logits = given
+        w = softmax(logits[0])[:, None] if logits else np.ones((1, 1))
+        center = np.sum(w * mean, axis=0)
+        variance = np.sum(w * (mean - center) ** 2, axis=0) + np.exp(2 * log_std)
+        deviation = np.sqrt(variance)
+    many = np.tile(observation, (20_000, 1))
+    for drawn in (
+        numpy_policy.make(weights)(many, np.random.default_rng(0)),
+        policy.make(weights)(many, jax.random.key(0)),
+    ):
+        if kind == "categorical":
+            drawn = np.eye(3)[drawn]
+        else:
+            np.testing.assert_allclose(drawn.std(axis=0), deviation, rtol=0.03)
+        most = 4 * (np.max(deviation) + 0.5) / 20_000**0.5
+        np.testing.assert_allclose(drawn.mean(axis=0), center, atol=most)
 
 
 def test_it_needs_no_jax(saved):
-    _, _, _, folder = saved
+    *_, folder = saved
     code = (
         "import sys, numpy as np\n"
         "for name in ('jax', 'jaxlib', 'flax', 'optax', 'mujoco'):\n"

@@ -28,14 +28,9 @@ def test_gae_equals_a_plain_loop():
                 weight *= gamma * lam
                 if ended[t, env]:
                     break
+    ends = {"terminated": terminated, "ended": ended}
     result = ppo.generalized_advantage_estimation(
-        reward,
-        value,
-        next_value,
-        terminated=terminated,
-        ended=ended,
-        gamma=gamma,
-        gae_lambda=lam,
+        reward, value, next_value, **ends, gamma=gamma, gae_lambda=lam
     )
     np.testing.assert_allclose(result, expected, rtol=1e-5, atol=1e-5)
 
@@ -46,15 +41,10 @@ def test_loss_equals_numpy():
     action, mean = rng.normal(size=(2, n, size))
     log_std = rng.normal(size=size) * 0.3
     value, advantage, return_ = rng.normal(size=(3, n))
-    log_prob = np.array(
-        [
-            sum(
-                -0.5 * ((a - m) / np.exp(s)) ** 2 - s - 0.5 * np.log(2 * np.pi)
-                for a, m, s in zip(row, means, log_std, strict=True)
-            )
-            for row, means in zip(action, mean, strict=True)
-        ]
+    one = lambda a, m, s: (
+        -0.5 * ((a - m) / np.exp(s)) ** 2 - s - 0.5 * np.log(2 * np.pi)
     )
+    log_prob = np.array([sum(map(one, *x, log_std)) for x in zip(action, mean)])
     old = log_prob + rng.normal(size=n) * 0.3
     config = Config(clip_epsilon=0.2, entropy_coefficient=0.01)
     surrogate = []

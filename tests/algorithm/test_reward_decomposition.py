@@ -24,17 +24,7 @@ MODEL = gasil_jax.Decompose(
 )
 
 
-_windows = jax.jit(decomposition.windows)
-
-
-def windows_of(history):
-    """The windows of a history, in NumPy."""
-    return jax.tree.map(np.asarray, _windows(history))
-
-
-def new_history(num_envs=NUM_ENVS, **more):
-    sizes = {"observation_size": OBS, "action_size": ACT, "keep_next": True}
-    return rollout.init_history(num_envs, NUM_STEPS, LIMIT, **sizes, **more)
+windows = jax.jit(decomposition.windows)
 
 
 def random_batches(seed, num_batches, delay=5):
@@ -96,7 +86,8 @@ def decompose_once(state, history, batch, key, learning_rate):
 
 def decompose_all(batches, failed=()):
     """Decompose all batches; updates of the network after some of them are infinite."""
-    history = new_history()
+    sizes = {"observation_size": OBS, "action_size": ACT, "keep_next": True}
+    history = rollout.init_history(NUM_ENVS, NUM_STEPS, LIMIT, **sizes)
     history_steps = history.reward.shape[1]
     state = MODEL.init(
         jax.random.key(0), Sizes(CONFIG.num_envs, OBS, ACT, history_steps)
@@ -130,7 +121,7 @@ def test_windows_of_the_history_are_those_of_a_plain_loop_and_have_what_they_pai
                         position = ring - len(steps) + t
                         expected[env, position] = (payout[env], t + 1 - begin)
                     begin = t + 1
-        result = windows_of(history)
+        result = jax.tree.map(np.asarray, windows(history))
         assert {*zip(*np.nonzero(result.ends), strict=True)} == set(expected)
         given = np.asarray(history.in_time(state.reward))
         for (env, end), (payout, length) in expected.items():
@@ -232,7 +223,6 @@ def test_ppo_learns_from_a_return_that_is_paid_at_the_end():
     )
     keys = jax.vmap(jax.random.key)(jnp.arange(2))
     returns = jax.jit(jax.vmap(train))(keys)[1]["episode_return"]
-    print("returns:", returns[:, -5:].mean(axis=1))
     # Without the model they are 20.0 and 16.6.
     assert (returns[:, -5:].mean(axis=1) > 22.5).all()
 

@@ -21,15 +21,9 @@ def test_replay_holds_the_returns_of_ended_episodes_across_batches():
 
     @jax.jit
     def add(replay, history, observation, reward, ended):
-        batch = types.SimpleNamespace(
-            observation=observation,
-            action=-observation,
-            reward=reward,
-            ended=ended,
-            faulty=False,
-            cut_short=False,
-        )
-        history = record(history, batch)
+        steps = {"observation": observation, "action": -observation, "reward": reward}
+        ends = {"ended": ended, "faulty": False, "cut_short": False}
+        history = record(history, types.SimpleNamespace(**steps, **ends))
         replay = self_imitation.insert(replay, history, num_steps, gamma=GAMMA)
         return replay, history
 
@@ -116,14 +110,9 @@ def test_loss_and_its_gradient_against_numpy():
 
     def total(log_prob, value):
         array = lambda x: jnp.asarray(x, jnp.float32)
-        return self_imitation.loss(
-            array(log_prob),
-            array(value),
-            array(return_),
-            weight=array(weight),
-            scale=scale,
-            value_coefficient=0.01,
-        )[0]
+        given = {"weight": array(weight), "scale": scale, "value_coefficient": 0.01}
+        seen = array(log_prob), array(value), array(return_)
+        return self_imitation.loss(*seen, **given)[0]
 
     by_log_prob, by_value = jax.grad(total, argnums=(0, 1))(
         jnp.asarray(log_prob, jnp.float32), jnp.asarray(value, jnp.float32)

@@ -37,26 +37,17 @@ class Clock(Env):
         return state.replace(obs=obs, reward=jnp.float32(-1), done=done)
 
 
-def make(limit=LIMIT, delay=1, **arguments):
-    env = wrappers.EpisodeLimit(Clock(**arguments), limit)
+def make(delay=1, **arguments):
+    env = wrappers.EpisodeLimit(Clock(**arguments), LIMIT)
     return env if delay == 1 else wrappers.RewardDelay(env, delay)
 
 
-def collect(env, num_envs, num_steps, limit=LIMIT, stagger=True):
-    environments = rollout.init(
-        env, jax.random.key(1), num_envs, age_limit=limit if stagger else None
-    )
+def collect(env, num_envs, num_steps):
+    environments = rollout.init(env, jax.random.key(1), num_envs, age_limit=LIMIT)
     policy = lambda observation: (jnp.zeros((num_envs, 1)), jnp.zeros(1))
-    batch = rollout.collect(
-        env,
-        policy,
-        environments,
-        jax.random.key(2),
-        distribution=GAUSSIAN,
-        num_steps=num_steps,
-        max_episode_steps=limit,
-        gamma=1.0,
-    )[1]
+    sizes = {"num_steps": num_steps, "max_episode_steps": LIMIT}
+    given = env, policy, environments, jax.random.key(2)
+    _, batch = rollout.collect(*given, distribution=GAUSSIAN, **sizes, gamma=1.0)
     return np.asarray(environments.starting_age), batch
 
 

@@ -37,7 +37,7 @@ def trained(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def swept(tmp_path_factory):
-    """A sweep of four points with two of the run's seeds; point 0 is the run's."""
+    """A sweep of two points with two of the run's seeds; point 0 is the run's."""
     folder = tmp_path_factory.mktemp("swept")
     more = ("--seeds", "2", "--evaluate-every", "512")
     return _done(folder, sweep, *SMALL, *more, *GRID)

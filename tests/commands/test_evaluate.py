@@ -66,26 +66,13 @@ def test_gymnasiums_episodes_have_the_runs_limit():
         assert scores["episode_length"] == [length]
 
 
-@pytest.fixture(scope="module")
-def untrained():
-    """The environment, the algorithm, and the state of a policy that is drawn."""
+def test_scores_are_those_of_a_plain_loop():
     env = gasil_jax.make_env("point_mass", reward_delay=7)
     algorithm = gasil_jax.algorithm("ppo", hidden_sizes=(16, 8))
-    states = drawn_policies(env, algorithm, 1, whole=True)
-    return env, algorithm, gasil_jax.member(states, 0)
-
-
-def scores(env, algorithm, state, **given):
-    return jax.jit(
-        lambda state, key: evaluation.evaluate(
-            env, algorithm, state, key=key, num_episodes=3, **given
-        )
-    )(state, jax.random.key(3))
-
-
-def test_scores_are_those_of_a_plain_loop(untrained):
-    env, _, state = untrained
-    scored = scores(*untrained)
+    state = gasil_jax.member(drawn_policies(env, algorithm, 1, whole=True), 0)
+    given = {"key": jax.random.key(3), "num_episodes": 3}
+    evaluate_ = lambda **x: evaluation.evaluate(env, algorithm, state, **given, **x)
+    scored = jax.jit(evaluate_)()
     act = numpy_policy.make(policy.weights(state, env))
     reset, step = jax.jit(env.reset), jax.jit(env.step)
     key, _ = jax.random.split(jax.random.key(3))
@@ -97,5 +84,5 @@ def test_scores_are_those_of_a_plain_loop(untrained):
             length += 1
         np.testing.assert_allclose(scored["episode_return"][i], total, rtol=1e-3)
         assert int(scored["episode_length"][i]) == length == 50
-    drawn = scores(*untrained, deterministic=False)
+    drawn = jax.jit(lambda: evaluate_(deterministic=False))()
     assert not np.allclose(drawn["episode_return"], scored["episode_return"])

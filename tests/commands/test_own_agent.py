@@ -7,7 +7,7 @@ import re
 
 import pytest
 from refusals import refused, rows
-from small_training import DISCRIMINATOR_FLAGS, FLAGS
+from small_training import FLAGS
 
 import gasil_jax
 from gasil_jax import algorithms, evaluate, render, run, sweep
@@ -38,7 +38,7 @@ class Own(gasil_jax.Agent):
         return state, reward, {"my_weight": self.my_weight}
 
 
-class Derived(gasil_jax.PPOGASIL):
+class Derived(gasil_jax.PPOBC):
     my_bonus: float = number(0.5, 0.0)
 
     def update_and_reward(self, state, context, key):
@@ -101,6 +101,8 @@ leaves:Own | 'leaves:Own' can't be imported: SystemExit: 3
 my_agents | 'my_agents' is unknown: it must be .*, gail, MODULE:CLASS$
 """
 SMALL = (*FLAGS, "--agent", "my_agents:Own")
+# Pictures are drawn, and not written, which takes long.
+pytestmark = pytest.mark.usefixtures("figures")
 
 
 @pytest.fixture(autouse=True)
@@ -125,11 +127,11 @@ def metrics(folder):
 def test_every_command_takes_it(tmp_path, capsys):
     """Also one that is derived from another agent, with the numbers of both."""
     out = tmp_path / "run"
-    derived = (*FLAGS, *DISCRIMINATOR_FLAGS, "--agent", "my_agents:Derived")
-    own = ("--my-bonus", "0.25", "--alpha", "0.3", "--buffer-steps", "70")
-    assert run.main([*derived, *own, "--no-stagger-episodes", "--out", str(out)]) == 0
+    derived = (*FLAGS, "--agent", "my_agents:Derived", "--no-stagger-episodes")
+    own = ("--my-bonus", "0.25", "--buffer-episodes", "3", "--buffer-steps", "70")
+    assert run.main([*derived, *own, "--out", str(out)]) == 0
     described = json.loads((out / "config.json").read_text())["algorithm"]
-    expected = {"agent": "my_agents:Derived", "my_bonus": 0.25, "alpha": 0.3}
+    expected = {"agent": "my_agents:Derived", "my_bonus": 0.25, "buffer_episodes": 3}
     assert described == described | expected | {"buffer_steps": 70}
     assert column(metrics(out), "good_steps") == {0, 70}
     again = ["--out", out, "--resume"]

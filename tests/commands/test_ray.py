@@ -15,7 +15,7 @@ import pytest
 from small_training import FLAGS
 
 from gasil_jax import sweep
-from gasil_jax.cli import options
+from gasil_jax.host import ray_launcher
 
 ray = pytest.importorskip("ray")
 
@@ -38,7 +38,9 @@ def process_of(folder):
     return int(re.match(r"process (\d+)", (folder / ".lock").read_text()).group(1))
 
 
-def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp_path):
+def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(
+    cluster, tmp_path, figures
+):
     out = tmp_path / "out"
     killed, programs = [], []
 
@@ -71,14 +73,8 @@ def test_the_shard_of_a_killed_worker_continues_from_its_checkpoint(cluster, tmp
     assert {p: p.stat().st_mtime_ns for p in (out / "programs").rglob("*")} == before
 
 
-def test_a_shard_that_fails_is_named(cluster, tmp_path, capsys):
-    """A file stands where the folder of the programs must be made."""
-    out = tmp_path / "out"
-    arguments = [*FLAGS, "--grid", "alpha=1", "--out", str(out)]
-    _, requested = options.read(options.SweepOptions, arguments, "x")
-    out.mkdir()
-    requested.write(out)
-    (out / "programs").touch()
-    arguments += ["--launcher", "ray", "--shards", "1", "--resume"]
-    assert sweep.main(arguments) == 1
-    assert "shard 1/1 (status 2) failed, see above" in capsys.readouterr().err
+def test_a_shard_that_fails_is_named(cluster):
+    """Here a program that imports nothing, and returns 2 at an unknown option."""
+    told = r"shard 1/1 \(status 2\) failed, see above"
+    with pytest.raises(ChildProcessError, match=told):
+        ray_launcher.run_on_ray("timeit", {"shard 1/1": ["--unknown"]}, 1)

@@ -31,6 +31,8 @@ run | --env is missing: see --help
 run --env walker | env 'walker' is unknown: did you mean 'walker2d'? (one
 run --env zoo | env 'zoo' is unknown: it must be one of point_mass, hopper
 run --env gymnx:Catch-bsuite | did you mean 'gymnax:Catch-bsuite'? (one of br
+run --env gymnax:Breakout | did you mean 'gymnax:Breakout-MinAtar'
+run --env brax:fast:x | env 'brax:fast:x' is unknown: it must be one of brax:ant
 run --env brax:ant --physics mujoco | leave it out, brax:ant has its own
 run --env nowhere:Line | 'nowhere:Line' can't be imported: No module
 run --env json:Line | has no attribute 'Line'
@@ -122,7 +124,7 @@ score --out x.txt | it must end in .csv
 score --out /proc/scores.csv | /proc/scores.csv, which can't be written
 evaluate RUN/programs | has no config.json: it must be the folder of a run or a swe
 evaluate RUN/nowhere | does not exist: it must be the folder of a run or a sweep
-swept --point 4 | has points 0 to 3
+swept --point 4 | has points 0 to 1
 swept --point 1 --checkpoint best | it must be 'last'
 draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
 draw --out x.txt | must end in .png, .pdf, .svg

@@ -85,13 +85,13 @@ def test_points_from_a_file(tmp_path):
 
 def test_a_sweep_from_end_to_end(swept):
     out, told, printed = swept
-    assert "x 8 runs" in told
+    assert "x 4 runs" in told
+    assert "warning: numbers that were not finite in seeds [5, 6]" in told
+    # While it trains, once.
+    assert told.count("warning: an update was undone because a number in it") == 1
     best, speed, following = printed.splitlines()
     value = r"-?\d+\.\d"
-    sentence = (
-        rf"point (0|1), learning_rate=0.0003, discriminator_updates=(3|1): "
-        rf"mean {value}, interquartile mean {value}$"
-    )
+    sentence = rf"point 0, learning_rate=0.0003: mean {value}, interq\w+ mean {value}$"
     assert re.match(f"best mean: {sentence}", best), best
     assert re.match(r"[\d,]+ steps/s on .*, in out$", speed), speed
     commands = "python -m gasil_jax.evaluate out; python -m gasil_jax.plot out; "
@@ -99,23 +99,23 @@ def test_a_sweep_from_end_to_end(swept):
 
     rows = table(out / "results.csv")
     assert [(row["point"], row["seed"]) for row in rows] == [
-        (str(point), seed) for point in range(4) for seed in "56"
+        (point, seed) for point in "01" for seed in "56"
     ]
-    assert [row["discriminator_updates"] for row in rows[::2]] == ["3", "1", "3", "1"]
-    # The points beyond float32 did not harm the others.
+    assert [row["learning_rate"] for row in rows[::2]] == ["0.0003", "1e+30"]
+    # The point beyond float32 did not harm the other.
     diverged = [int(row["skipped_updates"]) > 0 for row in rows]
-    assert diverged == [False] * 4 + [True] * 4
+    assert diverged == [False, False, True, True]
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["best_by_mean"] in (0, 1)
-    assert [point["diverged_seeds"] for point in summary["points"]] == [0, 0, 2, 2]
+    assert summary["best_by_mean"] == 0
+    assert [point["diverged_seeds"] for point in summary["points"]] == [0, 2]
     assert summary["device_count"] == jax.local_device_count()
     for name in ("learning_curve.png", "sweep.png", "hyperparameters.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     curves = np.load(out / "curves.npz")
     assert {"env_steps", "approx_kl", "bonus"} < set(curves)
     for name in curves:
-        assert curves[name].shape == (4, 2, 3 if "evaluation" in name else 4), name
-    assert curves["evaluation_env_steps"][3, 1].tolist() == [0, 512, 1024]
+        assert curves[name].shape == (2, 2, 3 if "evaluation" in name else 4), name
+    assert curves["evaluation_env_steps"][1, 1].tolist() == [0, 512, 1024]
     assert summary["evaluation_seconds"] > 0
     final = curves["evaluation_mean"][..., -1]
     written = [float(row["final_evaluation"]) for row in rows]
@@ -211,7 +211,7 @@ def test_other_settings_and_a_folder_of_something_else_are_refused(
     assert len(planned) == 1
 
 
-def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
+def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys, figures):
     long = (*FLAGS, "--agent", "ppo", "--total-steps", str(60 * 128), "--seeds", "2")
     grid = ("--grid", "gamma=0.9,0.99", "num_epochs=1,2")
     whole, out = tmp_path / "whole", tmp_path / "interrupted"
@@ -246,7 +246,7 @@ def test_an_interrupted_sweep_continues(tmp_path, monkeypatch, capsys):
     assert (first / "training.json").read_bytes() == seconds
 
 
-def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys):
+def test_several_agents_are_points_of_one_sweep(tmp_path, monkeypatch, capsys, figures):
     monkeypatch.chdir(tmp_path)
     agents = ("--agent", "ppo,ppo+sil", "--devices", "2")
     own = ("--sil-coefficient", "0.3", "--gamma", "0.9", "--total-steps", "512")

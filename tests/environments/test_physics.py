@@ -35,6 +35,7 @@ SIMPLE, FLAT, PYRAMID = (
     ((1, 1), (1, -1), (1, 0)),
     ((1, 1, 0), (1, -1, 0), (1, 0, 1), (1, 0, -1)),
 )
+AXES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 def solve(problem, iterations=4):
@@ -136,6 +137,17 @@ def problems(batch, size, groups, seed=0, *, pulling=False):
         "bound": bound,
     }
     return arrays, jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), problem)
+
+
+def with_cones(problem):
+    """Make the first group of contacts have elliptic cones."""
+    group, *others = problem.contacts
+    weight = group.weight[..., :1]
+    cone = newton.Cone(
+        jnp.broadcast_to(jnp.array([0.3, 0.7, 1, 2, 5])[:, None], weight.shape)
+    )
+    group = group.replace(weight=weight, bound=cone)
+    return problem.replace(contacts=(group, *others))
 
 
 def batch_last(problem):
@@ -248,11 +260,15 @@ def test_the_gpu_s_elimination_solves_the_same(size):
         (16, [(3, PYRAMID)], False),
         (23, [(9, PYRAMID)], False),
         (18, [(3, PYRAMID), (4, SIMPLE)], True),
+        (9, [(5, AXES), (2, SIMPLE)], False),
     ],
 )
 def test_the_kernel_of_a_gpu_solves_the_same(size, groups, pulling):
     """Its operations are run by XLA; that it compiles for a GPU is another test."""
     _, problem = problems((40,), size, groups, pulling=pulling)
+    has_cones = bool(groups) and groups[0][1] == AXES
+    if has_cones:
+        problem = with_cones(problem)
     contacts = []
     for group in problem.contacts:
         # The last contact is in play nowhere, and the one before it here and there.
@@ -260,7 +276,7 @@ def test_the_kernel_of_a_gpu_solves_the_same(size, groups, pulling):
         in_play[:, -1] = in_play[::2, -2] = 0.0
         contacts.append(group.replace(weight=group.weight * in_play))
     problem = batch_last(problem.replace(contacts=tuple(contacts)))
-    most = (20, 20) if pulling else (6, 4)
+    most = (20, 20) if pulling or has_cones else (6, 4)
     expected = jax.jit(functools.partial(solver.solve_many, *most))(problem)
     kernel = functools.partial(newton_kernel.solve_many, *most, interpret=True)
     jax.tree.map(
@@ -288,13 +304,14 @@ def test_old_and_other_gpus_have_no_triton(monkeypatch, capability, expected):
     assert batching.has_triton() is expected
 
 
-@pytest.mark.parametrize(("whole", "pulling"), [(0, 0), (1, 0), (1, 1)])
-def test_the_kernels_of_a_gpu_can_be_lowered_for_one(whole, pulling):
-    _, problem = problems((20,), 9, [(3, SIMPLE), (8, PYRAMID)], pulling=pulling)
-    problem = batch_last(problem)
+@pytest.mark.parametrize("what", ["elimination", "pushing", "pulling", "cones"])
+def test_the_kernels_of_a_gpu_can_be_lowered_for_one(what):
+    groups = [(5, AXES)] if what == "cones" else [(3, SIMPLE), (8, PYRAMID)]
+    _, problem = problems((20,), 9, groups, pulling=what == "pulling")
+    problem = batch_last(with_cones(problem) if what == "cones" else problem)
 
     def solve(problem):
-        if whole:
+        if what != "elimination":
             return newton_kernel.solve_many(4, 4, problem)
         return newton_kernel.eliminate_many(problem.inertia, problem.force)
 
@@ -320,22 +337,21 @@ def test_a_materialized_value_is_no_part_of_its_users_loops():
     assert num_loops(batching.materialize) > num_loops(lambda x: x) > 0
 
 
-BALL = """<mujoco><option cone="{cone}" timestep="0.01"/><worldbody>
+BALL = """<mujoco><option integrator="{integrator}" timestep="0.01"/><worldbody>
 <geom type="plane" size="5 5 1"/>
 <body pos="0 0 0.09"><freejoint/><geom type="sphere" size="0.1" mass="1"/></body>
 </worldbody></mujoco>"""
 
 
-@pytest.mark.parametrize("cone", ["pyramidal", "elliptic"])
-def test_a_model_that_the_small_solver_cant_take_falls_back(cone, caplog):
-    model = mujoco.MjModel.from_xml_string(BALL.format(cone=cone))
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast"])
+def test_a_model_that_the_small_solver_cant_take_falls_back(integrator, caplog):
+    model = mujoco.MjModel.from_xml_string(BALL.format(integrator=integrator))
     physics = ours_or_mjx(model)
-    assert ("its friction cones are elliptic" in caplog.text) == (cone == "elliptic")
+    falls_back = "without others, with implicitfast" in caplog.text
+    assert falls_back == (integrator == "implicitfast")
     data = mujoco.MjData(model)
     data.qvel[:] = [0.3, 0.0, -0.2, 1.0, 2.0, 3.0]
-    state = physics.init(
-        jnp.asarray(data.qpos, jnp.float32), jnp.asarray(data.qvel, jnp.float32)
-    )
+    state = PhysicsState(*map(jnp.float32, (data.qpos, data.qvel, 0 * data.qvel)))
     step = jax.jit(lambda state: physics.step(state, jnp.zeros(0), 10)[0])
     state = step(state)
     mujoco.mj_step(model, data, 10)
@@ -452,7 +468,7 @@ def test_host_physics_in_nested_batches_and_a_scan_is_plain_mujoco(fields):
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=3))
     physics = native.MujocoPhysics(model, fields, threads=2)
     angle = jnp.linspace(-1.0, 1.0, 6).reshape(2, 3, 1)
-    state = jax.vmap(jax.vmap(physics.init))(angle, 0.5 * angle)
+    state = PhysicsState(angle, 0.5 * angle, 0.0 * angle)
     control = jnp.float32([0.7])
 
     def body(state, _):
@@ -479,7 +495,7 @@ def test_host_physics_in_nested_batches_and_a_scan_is_plain_mujoco(fields):
 def test_a_simulation_that_fails_is_nan_and_harms_no_other(fields, capfd):
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(gear=1))
     physics = native.MujocoPhysics(model, fields, threads=2)
-    state = jax.vmap(physics.init)(jnp.zeros((4, 1)), jnp.zeros((4, 1)))
+    state = PhysicsState(*(jnp.zeros((4, 1)) for _ in range(3)))
     # MuJoCo warns, and puts it back at the start.
     state = state.replace(qvel=state.qvel.at[2].set(1e12))
     # What has failed before is not simulated again, which would print a warning.

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from refusals import rows
 
 from gasil_envs import Locomotion, Task
 from gasil_envs.locomotion import ASSETS
@@ -118,7 +119,6 @@ def test_a_task_s_own_functions_make_its_episodes():
             },
             "a medium or a free body without others, with implicitfast",
         ),
-        ({"top": '<option cone="elliptic"/>'}, "cones are elliptic"),
     ],
 )
 def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):
@@ -128,36 +128,27 @@ def test_what_the_fast_physics_lacks_is_noted(parts, what, caplog):
     assert what in caplog.text and "\n" not in caplog.records[0].getMessage()
 
 
-@pytest.mark.parametrize(
-    ("parts", "what"),
-    [
-        ({"joint": 'stiffness="1 2 3"'}, "nonlinear springs"),
-        ({"joint": 'damping="1 2 3"'}, "nonlinear damping"),
-        ({"motor": 'ctrlrange="-1 1" damping="3"'}, "actuators with damping"),
-        ({"motor": 'ctrlrange="-1 1" armature="3"'}, "actuators with armature"),
-        (
-            {"geom": 'fluidshape="ellipsoid"', "top": '<option density="9"/>'},
-            "fluidshape",
-        ),
-        ({"top": '<option integrator="discrete"/>'}, "integrator"),
-        ({"top": '<option><flag override="enable"/></option>'}, "the flag override"),
-        (
-            {"world": '<geom type="box" size="1 1 1"/>', "body": CYLINDER},
-            "CYLINDER",
-        ),
-        (
-            {
-                "motor": 'ctrlrange="-1 1"/><dcmotor joint="hinge" motorconst="1" '
-                'resistance="1" ctrlrange="-1 1"'
-            },
-            "DCMOTOR",
-        ),
-        ({"top": '<option noslip_iterations="3"/>'}, "noslip_iterations"),
-        ({"top": '<option integrator="implicit"/>'}, "IMPLICIT"),
-    ],
-)
+DC = 'ctrlrange="-1 1"/><dcmotor joint="hinge" motorconst="1" resistance="1"'
+FILTER = '<general dyntype="filter" dynprm="1" name="a"'
+#: Parts of the arm, and what MJX lacks.
+LACKING = """
+joint='stiffness="1 2 3"' | nonlinear springs
+joint='damping="1 2 3"' | nonlinear damping
+motor='ctrlrange="-1 1" damping="3"' | actuators with damping
+motor='ctrlrange="-1 1" armature="3"' | actuators with armature
+geom='fluidshape="ellipsoid"', top='<option density="9"/>' | fluidshape
+top='<option integrator="discrete"/>' | integrator
+top='<option><flag override="enable"/></option>' | the flag override
+world='<geom type="box" size="1 1 1"/>', body=CYLINDER | CYLINDER
+motor=f'{DC} ctrlrange="-1 1"' | DCMOTOR
+top='<option noslip_iterations="3"/>' | noslip_iterations
+top='<option integrator="implicit"/>' | IMPLICIT
+"""
+
+
+@pytest.mark.parametrize(("parts", "what"), rows(LACKING))
 def test_what_mjx_lacks_is_refused_and_c_mujoco_takes_it(parts, what):
-    task = Task(xml=arm(**parts), frame_skip=1, hidden_positions=0)
+    task = Task(xml=eval(f"arm({parts})"), frame_skip=1, hidden_positions=0)
 
     def one_step(physics):
         env = Locomotion(task, physics=physics)
@@ -211,46 +202,31 @@ def test_a_ball_starts_with_a_quaternion_of_length_1():
     np.testing.assert_allclose(jnp.linalg.norm(start.obs[1:5]), 1.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        (
-            {"xml": "<mujoco><worldbudy/></mujoco>"},
-            "xml is no model of MuJoCo: .*worldbudy",
-        ),
-        ({"xml": "nowhere.xml"}, "xml is no model of MuJoCo: .*nowhere.xml"),
-        ({"xml": arm(motor="")}, "actuator '' of the model has no ctrlrange: it must"),
-        ({"xml": "<mujoco/>"}, "the model has no actuators"),
-        (
-            {
-                "xml": arm().replace(
-                    "<motor", '<general dyntype="filter" dynprm="1" name="a"'
-                )
-            },
-            "the model has actuators with activations: its state must be",
-        ),
-        (
-            {"xml": arm().replace("<motor", '<pid kp="1"')},
-            "the model has actuators with several controls, such as pid",
-        ),
-        (
-            {"xml": arm(top='<option><flag sleep="enable"/></option>')},
-            "the model has the flag sleep: it must be disabled",
-        ),
-        ({"ls_iterations": 0}, "ls_iterations is 0: it must be 1 or more"),
-        ({"frame_skip": 0}, "frame_skip is 0: it must be 1 or more"),
-        ({"frame_skip": 2.5}, "frame_skip is 2.5: it must be 1 or more"),
-        ({"solver_iterations": 0}, "solver_iterations is 0: it must be 1 or more"),
-        ({"hidden_positions": 1}, "hidden_positions is 1: it must be .* has 1 entries"),
-        ({"healthy_z": (0.0, 1.0)}, "z_index is 1: it must be an index of qpos"),
-        ({"healthy_angle": (0.0, 1.0)}, r"healthy_angle is .* model has no qpos\[2\]"),
-        ({"fields": ("xpos", "site_xpos")}, "fields is .*: it must be a tuple of xpos"),
-    ],
-)
+#: What is changed in a task that fits the arm, and what is told.
+UNFIT = r"""
+xml="<mujoco><worldbudy/></mujoco>" | xml is no model of MuJoCo: .*worldbudy
+xml="nowhere.xml" | xml is no model of MuJoCo: .*nowhere.xml
+xml=arm(motor="") | actuator '' of the model has no ctrlrange: it must
+xml="<mujoco/>" | the model has no actuators
+xml=arm().replace("<motor", FILTER) | actuators with activations: its state must be
+xml=arm().replace("<motor", '<pid kp="1"') | actuators with several controls, such as p
+xml=arm(top='<option><flag sleep="enable"/></option>') | the flag sleep: it must be disa
+ls_iterations=0 | ls_iterations is 0: it must be 1 or more
+frame_skip=0 | frame_skip is 0: it must be 1 or more
+frame_skip=2.5 | frame_skip is 2.5: it must be 1 or more
+solver_iterations=0 | solver_iterations is 0: it must be 1 or more
+hidden_positions=1 | hidden_positions is 1: it must be .* has 1 entries
+healthy_z=(0.0, 1.0) | z_index is 1: it must be an index of qpos
+healthy_angle=(0.0, 1.0) | healthy_angle is .* model has no qpos\[2\]
+fields=("xpos", "site_xpos") | fields is .*: it must be a tuple of xpos
+"""
+
+
+@pytest.mark.parametrize(("changes", "message"), rows(UNFIT))
 def test_a_task_that_does_not_fit_its_model_is_refused(changes, message):
     fitting = {"xml": arm(), "frame_skip": 1, "hidden_positions": 0}
     with pytest.raises(ValueError, match=message) as told:
-        Locomotion(Task(**fitting | changes))
+        Locomotion(Task(**fitting | eval(f"dict({changes})")))
     assert "\n" not in str(told.value)
 
 

@@ -1,6 +1,5 @@
 """Environments of other packages: the contract, their limits, what is refused."""
 
-import subprocess
 import sys
 
 import jax
@@ -169,33 +168,6 @@ def test_a_part_is_chosen_and_every_dtype_becomes_float32(space, monkeypatch):
         low, high = wrappers.action_range(env)
         np.testing.assert_array_equal([low, high], [[-2.0] * 4, [1.0] * 4])
     check_reset_and_step(env, *map(jax.vmap, (env.reset, env.step)), same_start=True)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [
-        ("gymnax:Breakout", "did you mean 'gymnax:Breakout-MinAtar'"),
-        ("brax:fast:x", "env 'brax:fast:x' is unknown: it must be one of brax:ant"),
-        ("gymnx:CartPole-v1", "unknown family: did you mean 'gymnax:CartPole-v1'"),
-        ("cartpole", "unknown: it must be one of .*brax:NAME, gymnax:NAME, navix:NAME"),
-    ],
-)
-def test_an_unknown_name_or_family_is_refused_with_the_nearest(name, message):
-    with pytest.raises(ValueError, match=message):
-        gasil_envs.make(name)
-
-
-def test_a_family_is_not_imported_before_the_devices_are_chosen():
-    code = """
-from jax._src import xla_bridge
-from gasil_envs import registry
-registry.check("gymnax:CartPole-v1", registry.Settings())
-print(xla_bridge.backends_are_initialized())
-"""
-    result = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True
-    )
-    assert result.stdout == "False\n", result.stderr
 
 
 def test_a_missing_package_is_named(monkeypatch):

@@ -7,7 +7,6 @@ import os
 import signal
 import threading
 
-import jax
 import numpy as np
 import pytest
 
@@ -18,9 +17,7 @@ from experiments.engine import Setup
 from experiments.figures import FIGURES
 from experiments.store import Record, Store, read
 from gasil_jax.errors import InputError
-from gasil_jax.evaluation import evaluate
 from gasil_jax.host import interruption
-from gasil_jax.host.evaluations import evaluation_key
 from gasil_jax.host.members import Members
 from gasil_jax.host.runs import Run
 
@@ -62,29 +59,26 @@ def test_shards_are_all_runs_once_and_none_moves_when_others_join():
     assert engine.select_by_key(runs, 1, 1) == runs
 
 
-def test_a_record_is_what_make_train_gives(trained):
+def test_a_record_is_what_fit_gives(trained):
+    """Which trains as `make_train` does: test_members.py."""
     _, _, records = trained
     assert set(records) == set(RUNS)
-    env = gasil_jax.make_env("point_mass")
-    train = jax.jit(gasil_jax.make_train(env, RUNS[0].algorithm))
-    score = jax.jit(
-        lambda state, key: evaluate(
-            env, RUNS[0].algorithm, state, key=key, num_episodes=2
-        )
-    )
+    rates = [{}, {"learning_rate": 1e-4}]
+    scored = {"evaluate_every": 512, "evaluate_episodes": 2}
+    env, algorithm = gasil_jax.make_env("point_mass"), RUNS[0].algorithm
+    fitted = gasil_jax.fit(env, algorithm, seeds=2, points=rates, **scored)
     for each, record in records.items():
-        numbers = each.algorithm.hyperparameters
-        state, metrics = train(jax.random.key(each.seed), numbers)
+        at = int(each.algorithm != algorithm), each.seed
         assert record.env_steps.tolist() == [256 * i for i in range(1, 13)]
         for name in ("episode_return", "episode_length"):
-            np.testing.assert_allclose(getattr(record, name), metrics[name], rtol=2e-3)
+            expected = fitted.metrics[name][at]
+            np.testing.assert_allclose(getattr(record, name), expected, rtol=1e-5)
         assert record.provenance["commit"] == "c" and record.provenance["clean"]
         assert record.provenance["physics"] == "jax" and record.provenance["device"]
         # At most ten evaluations are spread over training.
         assert record.evaluation_steps.tolist() == [512 * i for i in range(1, 7)]
-        scores = score(state, evaluation_key(each.seed, 12))
-        expected = scores["episode_return"].mean()
-        assert record.evaluation_return[-1] == pytest.approx(expected, rel=2e-3)
+        scores = fitted.evaluations["mean"][at][1:]
+        np.testing.assert_allclose(record.evaluation_return, scores, rtol=1e-5)
 
 
 def test_what_is_trained_is_not_trained_again(trained, monkeypatch, tmp_path):
@@ -214,7 +208,7 @@ def test_processes_end_and_save_when_their_parent_is_interrupted(
     assert children and not children[0].is_alive()
     assert len(list(tmp_path.glob("runs/*/*/checkpoints/0*/manifest.json"))) == 1
     assert not list(tmp_path.glob("runs/*/*/training.json"))
-    assert __main__.main([*command, "--resume", "--processes", "2"]) == 0
+    assert __main__.main([*command, "--resume"]) == 0
     assert "Not trained yet" not in (tmp_path / "matrix.md").read_text()
 
 

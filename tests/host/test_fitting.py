@@ -31,6 +31,8 @@ FLAGS = (
 )
 EVALUATED = {"evaluate_every": 40 * 128, "evaluate_episodes": 2}
 TABLES = ("metrics.csv", "evaluations.csv")
+# Pictures are drawn, and not written, which takes long.
+pytestmark = pytest.mark.usefixtures("figures")
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,8 @@ from gasil_jax.host.sweep import read
 
 PPO = gasil_jax.algorithm("ppo", **SETTINGS)
 SMALL = (*FLAGS, "--agent", "ppo")
+# Pictures are drawn, and not written, which takes long.
+pytestmark = pytest.mark.usefixtures("figures")
 
 
 @pytest.fixture(scope="module")

@@ -304,8 +304,8 @@ def test_an_altered_command_line_ends_in_one_line(capsys, monkeypatch):
 def folder(tmp_path_factory):
     """The folder of a sweep of two points."""
     out = tmp_path_factory.mktemp("whole") / "out"
-    flags = [*FLAGS, "--agent", "ppo", "--max-episode-steps", "10"]
-    assert sweep.main([*flags, "--grid", "gamma=0.9,0.99", "--out", str(out)]) == 0
+    grid = ("--agent", "ppo", "--grid", "gamma=0.9,0.99")
+    assert sweep.main([*FLAGS, *grid, "--out", str(out)]) == 0
     return out
 
 

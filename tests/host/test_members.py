@@ -27,38 +27,39 @@ def compiled():
         **SETTINGS | DISCRIMINATOR | {"total_steps": 4 * 128},
         buffer_steps=100,
         stagger_episodes=False,
-        decompose_rewards=True,
+        normalize_rewards=True,
     )
     members = make_members(env, algorithm, [3, 4, 5], devices=jax.devices()[:2])
     states, advance = members.compile()
     return members, jax.tree.map(jnp.asarray, members.trim(states)), advance
 
 
-def trained(members, advance, states):
-    """Return metrics and parameters, (members, ...), after all iterations."""
-    metrics = []
-    for iteration in range(members.config.num_iterations):
+def trained(states, iterations=4):
+    """Train them from first states; return the last ones, and metrics (3, ...)."""
+    members, _, advance = compiled()
+    states, rows = members.to_devices(states), []
+    for iteration in range(iterations):
         states, new = members.train(advance, states, iteration, 1)
-        metrics.append(new)
-    params = jax.tree.map(np.asarray, members.trim(states).actor_critic.params)
-    return {name: np.concatenate([x[name] for x in metrics], 1) for name in new}, params
+        rows.append(new)
+    joined = {name: np.concatenate([x[name] for x in rows], axis=1) for name in new}
+    return jax.tree.map(jnp.asarray, members.trim(states)), joined
 
 
 @pytest.mark.xdist_group("members")
 def test_a_members_result_is_its_own():
     """With a seed and numbers of its own it is trained as `make_train` trains it."""
-    members, states, advance = compiled()
+    members, states, _ = compiled()
     half = {x: 0.5 * y for x, y in members.algorithm.hyperparameters.items()}
     del half["initial_std"]  # The first states are already drawn.
     numbers = {x: states.hyperparameters[x].at[1].set(half[x]) for x in half}
     numbers = {**states.hyperparameters, **numbers}
-    states = members.to_devices(states.replace(hyperparameters=numbers))
-    metrics, params = trained(members, advance, states)
+    states, metrics = trained(states.replace(hyperparameters=numbers))
     train = jax.jit(gasil_jax.make_train(members.env, members.algorithm))
     state, own = train(jax.random.key(members.seeds[1]), half)
     # A batch of another size is summed in another order, and learning lets that grow.
     close = lambda a, b: np.testing.assert_allclose(a[1], b, rtol=2e-3, atol=2e-4)
-    jax.tree.map(close, (metrics, params), (own, state.actor_critic.params))
+    ours, theirs = (x.actor_critic.params for x in (states, state))
+    jax.tree.map(close, (metrics, ours), (own, theirs))
     returns = metrics["episode_return"]
     assert np.nanmax(np.abs(returns[0] - returns[1])) > 0.1
 

@@ -14,32 +14,21 @@ import numpy as np
 from gasil_envs.physics import tendons, tree
 from gasil_envs.physics.batching import constant_times
 
-_OF_JOINT = (
-    int(mujoco.mjtTrn.mjTRN_JOINT),
-    int(mujoco.mjtTrn.mjTRN_JOINTINPARENT),
-)
+_OF_JOINT = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _OF_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
 
 class Actuators(NamedTuple):
-    """The constants of nu actuators.
+    """The constants of nu actuators."""
 
-    Attributes:
-      transmission: the lengths and velocities of the actuators.
-      gain: (nu, 3), constant, of length, of velocity.
-      bias: (nu, 3), the same.
-      control_range: (2, nu, 1).
-      force_range: (2, nu, 1).
-      joint_range: (2, V, 1), of the sum of the forces on a degree of freedom.
-    """
-
-    transmission: tendons.Tendons
-    gain: np.ndarray
-    bias: np.ndarray
-    control_range: np.ndarray
-    force_range: np.ndarray
+    transmission: tendons.Tendons  # The lengths and velocities of the actuators.
+    gain: np.ndarray  # (nu, 3), constant, of length, of velocity.
+    bias: np.ndarray  # (nu, 3), the same.
+    control_range: np.ndarray  # (2, nu, 1).
+    force_range: np.ndarray  # (2, nu, 1).
+    #: (2, V, 1), of the sum of the forces on a degree of freedom.
     joint_range: np.ndarray
 
     @property
@@ -54,10 +43,12 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `make` does not describe this model's actuators; None if it does."""
     kinds = model.actuator_trntype
     on_joint = np.isin(kinds, _OF_JOINT)
+    of_tendons = model.actuator_trnid[kinds == _OF_TENDON, 0]
     joint = model.jnt_type[model.actuator_trnid[on_joint, 0]]
     if model.na or model.nactuator != model.nu:
         return "it has actuators with a state or with several controls"
-    if not (on_joint | (kinds == _OF_TENDON)).all() or (joint <= tree.BALL).any():
+    others = not (on_joint | (kinds == _OF_TENDON)).all()
+    if others or tendons.strings(model)[of_tendons].any() or (joint <= tree.BALL).any():
         return "it has actuators of other things than slides, hinges and fixed tendons"
     if (
         not np.isin(model.actuator_gaintype, _GAINS).all()

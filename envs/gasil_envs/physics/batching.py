@@ -22,16 +22,15 @@ def keep_loops(physics: str) -> None:
     """Make XLA's CPU backend compile loops over a small batch to vector instructions.
 
     Otherwise XLA unrolls these loops and computes one number at a time: with 8 to 32
-    environments our physics is then 2 to 3 times slower, and MJX by half faster. So
-    nothing is done for physics "mjx". The option is of a whole process: this
-    function adds it to the environment variable XLA_FLAGS, so call it before JAX
-    starts. If XLA_FLAGS has --xla_backend_extra_options already, the variable is not
-    changed.
+    environments our physics is then 2 to 3 times slower, and MJX by half faster. The
+    option is of a whole process: it is added to the environment variable XLA_FLAGS, so
+    call this before JAX starts.
     """
     flags = os.environ.get("XLA_FLAGS", "")
     if physics != "mjx" and "xla_backend_extra_options" not in flags:
-        flags = f"{flags} --xla_backend_extra_options={_LOOPS}"
-        os.environ["XLA_FLAGS"] = flags.strip()
+        os.environ["XLA_FLAGS"] = (
+            f"{flags} --xla_backend_extra_options={_LOOPS}".strip()
+        )
 
 
 def on_cpu() -> bool:
@@ -144,12 +143,8 @@ def batch_last(
 ) -> Callable[[Any], Any]:
     """Make `jax.vmap`, nested if needed, extend a trailing batch axis.
 
-    Args:
-      function: from a tree of arrays to a tree of arrays, all with a trailing batch.
-      batched: the same function, to be called under `jax.vmap`; default `function`.
-
-    Returns:
-      The same function of arrays without a batch.
+    `function` is of trees of arrays with a trailing batch, and what is returned of
+    arrays without. `batched` is the same function, to be called under `jax.vmap`.
     """
     function = jax.custom_batching.custom_vmap(function)
     batched = jax.custom_batching.custom_vmap(batched or function)

@@ -14,30 +14,22 @@ _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
 class Candidates(NamedTuple):
-    """Pairs of geoms that may touch, P of them.
+    """Pairs of geoms that may touch, P of them."""
 
-    Attributes:
-      geoms: (P, 2), the one whose type has the lower number first.
-      dim: (P,), number of dimensions of the contact's force, condim.
-      margin: (P,), distance in metres from which a contact is in play.
-      friction: (P, 5), of two tangents, of turning about the normal and about them.
-      solref: (P, 2).
-      solimp: (P, 5).
-    """
-
-    geoms: np.ndarray
-    dim: np.ndarray
-    margin: np.ndarray
+    geoms: np.ndarray  # (P, 2), the one whose type has the lower number first.
+    dim: np.ndarray  # (P,), number of dimensions of the contact's force, condim.
+    margin: np.ndarray  # (P,), distance in metres from which a contact is in play.
+    #: (P, 5), of two tangents, of turning about the normal and about them.
     friction: np.ndarray
-    solref: np.ndarray
-    solimp: np.ndarray
+    solref: np.ndarray  # (P, 2).
+    solimp: np.ndarray  # (P, 5).
 
 
 def candidates(model: mujoco.MjModel) -> Candidates:
     """Return all pairs, in MJX's order: by condim, then types, as these first occur."""
     flags = mujoco.mjtDisableBit
     none = model.opt.disableflags & (flags.mjDSBL_CONSTRAINT | flags.mjDSBL_CONTACT)
-    rows = [] if none else list(_pairs(model))
+    rows = [] if none else _that_may_touch(model, list(_pairs(model)))
     parameters = [_parameters(model, *row) for row in rows]
     kinds = [
         (x[0], *model.geom_type[[g1, g2]])
@@ -84,14 +76,36 @@ def _pairs(model: mujoco.MjModel) -> Iterator[tuple[int, int, int]]:
         if is_parent and weld_a and weld_b and not parents_collide:
             continue
         for g1, g2 in itertools.product(geoms_of[a].tolist(), geoms_of[b].tolist()):
-            pair = _in_order(model, g1, g2)
-            g1, g2 = pair
+            g1, g2 = pair = _in_order(model, g1, g2)
             mask = (model.geom_contype[g1] & model.geom_conaffinity[g2]) | (
                 model.geom_contype[g2] & model.geom_conaffinity[g1]
             )
             if mask and pair not in seen and model.geom_type[g2] != _PLANE:
                 seen.add(pair)
                 yield (*pair, -1)
+
+
+def _that_may_touch(
+    model: mujoco.MjModel, rows: list[tuple[int, int, int]]
+) -> list[tuple[int, int, int]]:
+    """Leave out solids whose middles are equally far apart in any state, and too far.
+
+    The round hubs of two hinges are such a pair.
+    """
+    geoms = np.array([row[:2] for row in rows], int).reshape(-1, 2)
+    solid = model.geom_type[geoms].min(axis=1) > int(mujoco.mjtGeom.mjGEOM_CAPSULE)
+    if not solid.any():
+        return rows
+    data, rng, apart = mujoco.MjData(model), np.random.default_rng(0), []
+    for _ in range(3):
+        data.qpos[:] = model.qpos0 + rng.normal(size=model.nq)
+        mujoco.mj_kinematics(model, data)
+        apart.append(
+            np.linalg.norm(np.diff(data.geom_xpos[geoms], axis=1)[:, 0], axis=1)
+        )
+    reach = (model.geom_rbound + model.geom_margin)[geoms].sum(axis=1)
+    never = solid & (np.ptp(apart, axis=0) < 1e-9) & (apart[0] > reach)
+    return [row for row, x in zip(rows, never, strict=True) if not (x and row[2] < 0)]
 
 
 def _in_order(model: mujoco.MjModel, a: int, b: int) -> tuple[int, int]:

@@ -1,9 +1,10 @@
 """Contacts of geoms with planes that do not move, and of spheres and capsules.
 
 A sphere is a capsule of length 0, and each end of a capsule meets a plane as a sphere.
-Boxes, cylinders and ellipsoids meet planes in points, and a box a sphere. The formulas
-are C MuJoCo's, and every array has the batch as its last axis. Two things differ from
-MJX:
+Boxes, cylinders and ellipsoids meet planes in points, a box meets a sphere, and a
+cylinder spheres and capsules. The formulas are C MuJoCo's (but for a capsule whose axis
+is inside a cylinder, which C pushes out another way), and every array has the batch as
+its last axis. Two things differ from MJX:
 
 - The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
   C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
@@ -16,6 +17,8 @@ Shape letters: C contacts, A axes, B batch.
 """
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -28,6 +31,7 @@ from gasil_envs.physics.batching import (
     add,
     constant_times,
     materialize,
+    on_cpu,
     stacked,
     take,
     total,
@@ -43,44 +47,33 @@ _POINTS = {_ELLIPSOID: 1, _CYLINDER: 4, _BOX: 8}
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Pairs:
-    """The pairs of geoms of one group of contacts.
+    """The pairs of geoms of one group of contacts."""
 
-    Attributes:
-      on_plane: (2, n), planes and spheres or capsules.
-      end: (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
-      points: (2, k), planes and other geoms; all points of a pair follow each other.
-      between: (2, m), spheres and capsules.
-      boxes: (2, l), spheres and boxes. Contacts are in the order of these four.
-      num_tangents: number of tangents of a contact.
-      motion_normal: (3,), the normal of the plane that all motion is in, or None.
-    """
-
-    on_plane: np.ndarray
-    end: np.ndarray
+    on_plane: np.ndarray  # (2, n), planes and spheres or capsules.
+    end: np.ndarray  # (n,), 1 or -1 for an end of a capsule on a plane, 0 for a sphere.
+    #: (2, k), planes and other geoms; all points of a pair follow each other.
     points: np.ndarray
-    between: np.ndarray
-    boxes: np.ndarray
-    num_tangents: int
+    between: np.ndarray  # (2, m), spheres and capsules.
+    #: (2, l), spheres or capsules and boxes or cylinders. Contacts are in the order of
+    #: these four.
+    solids: np.ndarray
+    num_tangents: int  # Number of tangents of a contact.
+    #: (3,), the normal of the plane that all motion is in, or None.
     motion_normal: np.ndarray | None
 
     @property
     def geoms(self) -> np.ndarray:
         """The two geoms of each contact, (C, 2)."""
-        every = [self.on_plane, self.points, self.between, self.boxes]
+        every = [self.on_plane, self.points, self.between, self.solids]
         return np.concatenate(every, axis=1).T
 
 
 class Touch(NamedTuple):
-    """Where contacts are, in metres. An axis of length 1 is broadcast.
+    """Where contacts are, in metres. An axis of length 1 is broadcast."""
 
-    Attributes:
-      distance: (C, B), negative if they penetrate.
-      position: (C, 3, B).
-      axes: (C or 1, A, 3, B or 1): normal from the first geom to the second, tangents.
-    """
-
-    distance: jax.Array
-    position: jax.Array
+    distance: jax.Array  # (C, B), negative if they penetrate.
+    position: jax.Array  # (C, 3, B).
+    #: (C or 1, A, 3, B or 1): normal from the first geom to the second, tangents.
     axes: jax.Array | np.ndarray
 
 
@@ -101,14 +94,14 @@ def pairs(
     is_second = np.diff(on_plane, prepend=-1) == 0
     end = np.where(second[on_plane] == _CAPSULE, np.where(is_second, -1.0, 1.0), 0.0)
     points = np.repeat(number, count * (plane & ~rounded))
-    between, boxes = number[~plane & rounded], number[~plane & ~rounded]
-    index = np.concatenate([on_plane, points, between, boxes])
+    between, solids = number[~plane & rounded], number[~plane & ~rounded]
+    index = np.concatenate([on_plane, points, between, solids])
     every = Pairs(
         on_plane=geoms[on_plane].T,
         end=end,
         points=geoms[points].T,
         between=geoms[between].T,
-        boxes=geoms[boxes].T,
+        solids=geoms[solids].T,
         num_tangents=num_tangents,
         motion_normal=motion_normal,
     )
@@ -121,17 +114,15 @@ def unsupported(model: mujoco.MjModel, geoms: np.ndarray) -> str | None:
     on_plane = kinds[:, 0] == _PLANE
     round_geoms = [_SPHERE, _CAPSULE]
     for (first, second), plane in zip(kinds, on_plane, strict=True):
-        allowed = [*round_geoms, *_POINTS] if plane else round_geoms
+        allowed = [*round_geoms, *(_POINTS if plane else [_CYLINDER])]
         allowed = [*allowed, _BOX] if first == _SPHERE else allowed
         if second not in allowed or first > _CAPSULE:
-            names = " and ".join(
-                mujoco.mjtGeom(kind).name.removeprefix("mjGEOM_").lower()
-                for kind in (first, second)
-            )
-            return f"it has contacts of {names}"
+            names = [mujoco.mjtGeom(x).name[len("mjGEOM_") :] for x in (first, second)]
+            return f"it has contacts of {' and '.join(names).lower()}"
     if model.body_weldid[model.geom_bodyid[geoms[on_plane, 0]]].any():
         return "it has planes that move"
-    if stay_parallel(model, geoms[(kinds == _CAPSULE).all(axis=1)]):
+    long = (kinds[:, 0] == _CAPSULE) & np.isin(kinds[:, 1], [_CAPSULE, _CYLINDER])
+    if stay_parallel(model, geoms[long]):
         return "it has contacts of capsules that stay parallel"
     return None
 
@@ -158,16 +149,11 @@ def depth(model: mujoco.MjModel) -> float:
 
 
 class Segments(NamedTuple):
-    """The lines along the middle of geoms, metres.
+    """The lines along the middle of geoms, metres."""
 
-    Attributes:
-      middle: (geom, 3, B), their centres.
-      half: (geom, 3, B), from there to one end.
-      columns: rotations of the geoms that are no capsules, spheres or planes.
-    """
-
-    middle: jax.Array
-    half: jax.Array
+    middle: jax.Array  # (geom, 3, B), their centres.
+    half: jax.Array  # (geom, 3, B), from there to one end.
+    #: Rotations of the geoms that are no capsules, spheres or planes.
     columns: dict[int, list[jax.Array]]
 
 
@@ -176,8 +162,8 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
     """Return the line of each geom; that of a sphere or a plane is a point."""
     middle, half, rotations = [], [], {}
     for geom in range(model.ngeom):
-        columns = at.columns[model.geom_bodyid[geom]]
-        origin = at.xpos[model.geom_bodyid[geom]]
+        body = model.geom_bodyid[geom]
+        columns, origin = at.columns[body], at.xpos[body]
         middle.append(origin + tree.rotate(columns, model.geom_pos[geom]))
         matrix = np.zeros(9)
         mujoco.mju_quat2Mat(matrix, model.geom_quat[geom])
@@ -195,25 +181,21 @@ def segments(model: mujoco.MjModel, at: tree.Kinematics) -> Segments:
 @jax.named_scope("collision")
 def touch(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     """Return the contacts of a group."""
-    parts = []
-    if pairs.on_plane.size:
-        parts.append(_touch_planes(model, pairs, lines))
-    if pairs.points.size:
-        parts.append(_touch_planes_in_points(model, pairs, lines))
-    if pairs.between.size:
-        parts.append(_touch_each_other(model, pairs, lines))
-    if pairs.boxes.size:
-        parts.append(_touch_boxes(model, pairs, lines))
+    kinds = (
+        (pairs.on_plane, _touch_planes),
+        (pairs.points, _touch_planes_in_points),
+        (pairs.between, _touch_each_other),
+        (pairs.solids, _touch_solids),
+    )
+    parts = [function(model, pairs, lines) for x, function in kinds if x.size]
     if len(parts) == 1:
         return parts[0]
-    distance = jnp.concatenate([part.distance for part in parts])
-    position = jnp.concatenate([part.position for part in parts])
-
-    def shape(x: Touch) -> tuple[int, ...]:
-        return (x.position.shape[0], x.axes.shape[1], *x.position.shape[1:])
-
-    axes = [jnp.broadcast_to(part.axes, shape(part)) for part in parts]
-    return Touch(distance, position, jnp.concatenate(axes))
+    distance, position, axes = zip(*parts, strict=True)
+    wide = [
+        jnp.broadcast_to(x, (len(y), x.shape[1], *y.shape[1:]))
+        for x, y in zip(axes, position, strict=True)
+    ]
+    return Touch(*map(jnp.concatenate, (distance, position, wide)))
 
 
 def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
@@ -223,11 +205,10 @@ def _touch_planes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     def constant(x: Any) -> Any:
         return x.astype(np.float32)[..., None]
 
-    height = constant(height)
     radius = constant(model.geom_size[geom, 0])
     axis = take(lines.half, geom)
     centre = take(lines.middle, geom) + constant(pairs.end[:, None]) * axis
-    distance = total(constant(normal) * centre, 1) - height - radius
+    distance = total(constant(normal) * centre, 1) - constant(height) - radius
     position = centre - constant(normal) * (radius + 0.5 * distance)[:, None]
     if np.allclose(normal, normal[0]):
         normal = normal[:1]
@@ -271,9 +252,10 @@ def _touch_planes_in_points(
         elif model.geom_type[geom] == _CYLINDER:
             points = _rim(size, columns, up)
         else:
-            length = jnp.sqrt(total(jnp.stack(up) ** 2 * _squares(size)))
+            square = (size**2).astype(np.float32)[:, None]
+            length = jnp.sqrt(total(jnp.stack(up) ** 2 * square))
             lowest = -total(
-                jnp.stack(columns) * jnp.stack(up)[:, None] * _squares(size)[..., None]
+                jnp.stack(columns) * jnp.stack(up)[:, None] * square[..., None]
             )
             points = [(lowest / length, -length)]
         for away, lower in points:
@@ -283,15 +265,7 @@ def _touch_planes_in_points(
             positions.append(centre - normal.astype(np.float32)[:, None] * down)
             axes.append(normal)
     normals = jnp.asarray(np.stack(axes).astype(np.float32)[..., None])
-    frame = [normals]
-    if pairs.num_tangents:
-        frame.append(_orthogonal(normals))
-        frame.append(tree.cross(frame[0], frame[1]))
-    return Touch(stacked(distances), stacked(positions), jnp.stack(frame, axis=1))
-
-
-def _squares(size: np.ndarray) -> np.ndarray:
-    return (size**2).astype(np.float32)[:, None]
+    return Touch(stacked(distances), stacked(positions), _frames(pairs, normals))
 
 
 def _dot(vector: jax.Array, constant: np.ndarray) -> jax.Array:
@@ -335,41 +309,80 @@ def _rim(size: np.ndarray, columns: list[jax.Array], up: list[jax.Array]) -> _Po
     return points + [(axis - 0.5 * low + s * side, corner) for s in (1.0, -1.0)]
 
 
-def _touch_boxes(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
+# Halvings until the point of a capsule that is nearest to a cylinder is known.
+_HALVINGS = 25
+
+
+def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch:
     distances: list[jax.Array] = []
     positions: list[jax.Array] = []
     normals: list[jax.Array] = []
-    for sphere, box in pairs.boxes.T:
-        radius, columns = float(model.geom_size[sphere, 0]), lines.columns[box]
-        size = model.geom_size[box].astype(np.float32)[:, None]
-        offset = lines.middle[sphere] - lines.middle[box]
-        centre = stacked([total(column * offset) for column in columns])
-        clamped = jnp.clip(centre, -size, size)
-        away = clamped - centre
-        apart = jnp.sqrt(total(away**2))
-        # Where the sphere's centre is inside, the nearest side.
-        depth = size - jnp.abs(centre)
-        first, second, third = (
-            (depth[i] <= jnp.minimum(depth[i - 1], depth[i - 2])).astype(jnp.float32)
-            for i in range(3)
+    for geom, solid in pairs.solids.T:
+        columns, up = lines.columns[solid], np.eye(3, dtype=np.float32)[..., None]
+        size = model.geom_size[solid].astype(np.float32)[:, None]
+        is_round = model.geom_type[solid] == _CYLINDER
+        nearest = functools.partial(_nearest, size, is_round)
+        centre, half = (
+            stacked([total(column * x) for column in columns])
+            for x in (lines.middle[geom] - lines.middle[solid], lines.half[geom])
         )
-        second = second * (1 - first)
-        side = jnp.stack([first, second, third * (1 - first) * (1 - second)])
-        inside = apart <= 1e-7
-        inwards = jnp.where(centre > 0.0, -1.0, 1.0) * side
-        distance = jnp.where(inside, -total(side * depth), apart)
+        if model.geom_type[geom] == _CAPSULE:
+            centre = _nearest_on_line(nearest, centre, half)
+        away = nearest(centre) - centre
+        apart = _length(away)
+        sides = list(zip(centre, size, up, strict=True))
+        if is_round:
+            across = jnp.concatenate([centre[:2], 0.0 * centre[2:]])
+            length = _length(across)
+            sides = [(length, size[0], across / jnp.maximum(length, 1e-15))]
+            sides.append((centre[2], size[1], up[2]))
+        # Where the centre is inside, the nearest side.
+        depth, inwards = jnp.full_like(apart, jnp.inf), jnp.zeros_like(centre)
+        for along, most, axis in sides:
+            nearer = most - jnp.abs(along) < depth
+            depth = jnp.where(nearer, most - jnp.abs(along), depth)
+            inwards = jnp.where(nearer, jnp.where(along > 0.0, -axis, axis), inwards)
+        inside, radius = apart <= 1e-7, float(model.geom_size[geom, 0])
+        distance = jnp.where(inside, -depth, apart)
         normal = jnp.where(inside, inwards, away / jnp.maximum(apart, 1e-7))
         position = centre + normal * (0.5 * (radius + distance))
         distances.append(distance - radius)
-        for local, results in ((position, positions), (normal, normals)):
-            results.append(add(local[i] * columns[i] for i in range(3)))
-        positions[-1] = positions[-1] + lines.middle[box]
-    normal = stacked(normals)
-    axes = [normal]
-    if pairs.num_tangents:
-        axes.append(_orthogonal(normal))
-        axes.append(tree.cross(normal, axes[1]))
-    return Touch(stacked(distances), stacked(positions), jnp.stack(axes, axis=1))
+        for x, results in ((position, positions), (normal, normals)):
+            results.append(add(x[i] * columns[i] for i in range(3)))
+        positions[-1] = positions[-1] + lines.middle[solid]
+    axes = _frames(pairs, stacked(normals))
+    return Touch(stacked(distances), stacked(positions), axes)
+
+
+def _length(x: jax.Array) -> jax.Array:
+    return jnp.sqrt(total(x**2))
+
+
+def _nearest(size: np.ndarray, is_round: bool, x: jax.Array) -> jax.Array:
+    """Return the point of a cylinder or a box that is nearest to x, (3, B)."""
+    if not is_round:
+        return jnp.clip(x, -size, size)
+    within = jnp.minimum(size[0] / jnp.maximum(_length(x[:2]), 1e-15), 1.0)
+    flat = jnp.clip(x[2], -size[1], size[1])
+    return jnp.stack([x[0] * within, x[1] * within, flat])
+
+
+def _nearest_on_line(
+    nearest: Callable[[jax.Array], jax.Array], middle: jax.Array, half: jax.Array
+) -> jax.Array:
+    """Return the point of a line that is nearest to a convex body, (3, B)."""
+
+    def halve(_: Any, ends: tuple[jax.Array, jax.Array]) -> Any:
+        low, high = ends
+        at = 0.5 * (low + high)
+        point = middle + at * half
+        falls = total((point - nearest(point)) * half) < 0.0
+        return jnp.where(falls, at, low), jnp.where(falls, high, at)
+
+    one = jnp.ones_like(middle[0])
+    unroll = 1 if on_cpu() else _HALVINGS  # On a GPU each turn would be some kernels.
+    low, high = jax.lax.fori_loop(0, _HALVINGS, halve, (-one, one), unroll=unroll)
+    return middle + 0.5 * (low + high) * half
 
 
 def _orthogonal(normal: jax.Array | np.ndarray) -> jax.Array:
@@ -402,6 +415,11 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     )
     distance = apart - (radius[0] + radius[1])
     position = near_a + normal * (radius[0] + 0.5 * distance)[:, None]
+    return Touch(distance, position, _frames(pairs, normal))
+
+
+def _frames(pairs: Pairs, normal: jax.Array) -> jax.Array:
+    """Return normals (C, 3, B) and as many tangents as a group has, (C, A, 3, B)."""
     axes = [normal]
     if pairs.num_tangents and pairs.motion_normal is not None:
         across = pairs.motion_normal.astype(np.float32)[:, None]
@@ -409,7 +427,7 @@ def _touch_each_other(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> T
     elif pairs.num_tangents:
         axes.append(_orthogonal(normal))
         axes.append(tree.cross(normal, axes[1]))
-    return Touch(distance, position, jnp.stack(axes, axis=1))
+    return jnp.stack(axes, axis=1)
 
 
 def _nearest_points(

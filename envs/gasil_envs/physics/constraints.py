@@ -33,6 +33,7 @@ from gasil_envs.physics.batching import (
 _MOST_STIFFNESS = 1e5
 # The edges normal +- tangent, and the normal itself with twice the weight.
 _FLAT_PYRAMID = ((1, 1), (1, -1), (1, 0))
+_ELLIPTIC = mujoco.mjtCone.mjCONE_ELLIPTIC
 
 
 class Impedance(struct.PyTreeNode):
@@ -117,26 +118,23 @@ class Constants(struct.PyTreeNode):
     """The constants of a group's contacts, (C or 1, ..., 1) each.
 
     They do not depend on the state.
-
-    Attributes:
-      chain: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it
-        moves the first and 0 where it moves both or none.
-      body: (C, N, 1), 1 at the second body and -1 at the first, unless that is the
-        world; 0 elsewhere.
-      friction: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes.
-      margin: distance from which a contact is in play.
-      inverse_weight: of an edge of the pyramid.
-      least_resistance: of an edge, the inverse of its greatest weight.
-      impedance: of an edge.
     """
 
+    #: (C, V, 1), 1 where a degree of freedom moves the second body, -1 where it moves
+    #: the first and 0 where it moves both or none.
     chain: np.ndarray
+    #: (C, N, 1), 1 at the second body and -1 at the first, unless that is the world; 0
+    #: elsewhere.
     body: np.ndarray
+    #: (C or 1, tangents or 1, 1), of sliding, and of turning about the axes; of cones
+    #: these divided by their ratio.
     friction: np.ndarray
-    margin: np.ndarray
-    inverse_weight: np.ndarray
-    least_resistance: np.ndarray
-    impedance: Impedance
+    #: (C or 1, 1), that of elliptic cones, see `newton.Cone`; None of pyramids.
+    ratio: np.ndarray | None
+    margin: np.ndarray  # Distance from which a contact is in play.
+    inverse_weight: np.ndarray  # Of an edge of the pyramid.
+    least_resistance: np.ndarray  # Of an edge, the inverse of its greatest weight.
+    impedance: Impedance  # Of an edge.
 
 
 class Group(NamedTuple):
@@ -152,16 +150,11 @@ class Group(NamedTuple):
 
 
 class Strength(NamedTuple):
-    """How hard n rows push or pull, none of them of contacts.
+    """How hard n rows push or pull, none of them of contacts."""
 
-    Attributes:
-      inverse_weight: (n or 1, 1).
-      impedance: the coefficients.
-      bound: (n, 1), largest force of rows that push and pull; None if they only push.
-    """
-
-    inverse_weight: np.ndarray
+    inverse_weight: np.ndarray  # (n or 1, 1).
     impedance: Impedance
+    #: (n, 1), largest force of rows that push and pull; None if they only push.
     bound: np.ndarray | None
 
     @classmethod
@@ -174,28 +167,21 @@ class Strength(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """The limits of L slide and hinge joints, in metres or radians.
+    """The limits of L slide and hinge joints, in metres or radians."""
 
-    Attributes:
-      qpos: int (L,), index of each joint in qpos.
-      dof: int (L,), index of its degree of freedom.
-      low: float32 (L or 1, 1), its lower limit.
-      high: float32 (L or 1, 1), its upper limit.
-      margin: float32 (L or 1, 1), distance to a limit below which the limit acts.
-      strength: that of the limits.
-    """
-
-    qpos: np.ndarray
-    dof: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
+    qpos: np.ndarray  # int (L,), index of each joint in qpos.
+    dof: np.ndarray  # int (L,), index of its degree of freedom.
+    low: np.ndarray  # float32 (L or 1, 1), its lower limit.
+    high: np.ndarray  # float32 (L or 1, 1), its upper limit.
+    #: float32 (L or 1, 1), distance to a limit below which the limit acts.
     margin: np.ndarray
     strength: Strength
 
 
-#: (nq, B) positions -> (n, B) how far n rows are from being held, and their Jacobians
-#: (n, V, B). Rows that only push act where that is negative.
-Residual = Callable[[jax.Array], tuple[jax.Array, jax.Array]]
+#: (nq, B) positions and where they place the bodies -> (n, B) how far n rows are from
+#: being held, and their Jacobians (n, V, B). Rows that only push act where that is
+#: negative.
+Residual = Callable[[jax.Array, tree.Kinematics], tuple[jax.Array, jax.Array]]
 
 
 class Layout(NamedTuple):
@@ -221,8 +207,8 @@ class Contacts(NamedTuple):
 
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why `layout` can't describe this model, or None if it can."""
-    if model.opt.cone != mujoco.mjtCone.mjCONE_PYRAMIDAL:
-        return "its friction cones are elliptic"
+    if model.opt.cone == _ELLIPTIC and model.pair_solreffriction.any():
+        return "it has pairs of geoms with solreffriction"
     allowed = [int(mujoco.mjtEq.mjEQ_JOINT), int(mujoco.mjtEq.mjEQ_TENDON)]
     if not np.isin(model.eq_type[model.eq_active0.astype(bool)], allowed).all():
         return "it has equality constraints of bodies"
@@ -233,8 +219,6 @@ def unsupported(model: mujoco.MjModel) -> str | None:
     both.append(model.tendon_limited.astype(bool) & (span <= 2 * model.tendon_margin))
     if np.concatenate(both).any():
         return "it has joints or tendons whose two limits act at once"
-    if model.opt.enableflags & mujoco.mjtEnableBit.mjENBL_OVERRIDE:
-        return "its contact parameters are overridden"
     return collision.unsupported(model, candidates.candidates(model).geoms)
 
 
@@ -254,7 +238,8 @@ def layout(model: mujoco.MjModel) -> Layout:
     contact = candidates.candidates(model)
     normal = motion_normal(model, contact.geoms)
     round_geoms = model.geom_type[contact.geoms] <= int(mujoco.mjtGeom.mjGEOM_CAPSULE)
-    if (contact.dim > 3).any() or not round_geoms.all():
+    anisotropic = (contact.friction[:, 0] != contact.friction[:, 1]).any()
+    if (contact.dim > 3).any() or not round_geoms.all() or anisotropic:
         normal = None
     groups = [
         _group(model, contact, dim, motion_normal=normal)
@@ -265,30 +250,28 @@ def layout(model: mujoco.MjModel) -> Layout:
     if (loss := model.dof_frictionloss).any():
         solver = model.dof_solref, model.dof_solimp
         friction = Strength.of(model, model.dof_invweight0, solver, loss)
-    kinds = (_equalities, _tendon_friction, _tendon_limits, _ball_limits)
+    kinds = (_equalities, _tendon_limits, _ball_limits)
     others = tuple(rows for kind in kinds if (rows := kind(model)) is not None)
     return Layout(limits, tuple(groups), friction, others)
 
 
-def _pyramid(condim: int) -> tuple[tuple[int, ...], ...]:
-    """Return the edges normal +- tangent, for each direction of friction."""
-    if condim == 1:
-        return ((1,),)
-    tangents = np.eye(condim, dtype=int)[1:]
-    edges = [[1, *(sign * x[1:])] for x in tangents for sign in (1, -1)]
+def _edges(condim: int, *, flat: bool, elliptic: bool) -> tuple[tuple[int, ...], ...]:
+    """Return normal +- tangent for each direction of friction, or the axes of cones."""
+    axes = np.eye(2 if flat else condim, dtype=int)
+    if condim == 1 or elliptic:
+        return tuple(tuple(map(int, axis)) for axis in axes)
+    if flat:
+        return _FLAT_PYRAMID
+    edges = [axes[0] + sign * x for x in axes[1:] for sign in (1, -1)]
     return tuple(tuple(map(int, edge)) for edge in edges)
 
 
 def motion_normal(model: mujoco.MjModel, geoms: np.ndarray) -> np.ndarray | None:
     """Return the normal of the plane that contains all motion, or None if none does.
 
-    It is also None if a contact's tangents may be neither in the plane nor across it:
-    the edges of its pyramid are then others. MuJoCo makes tangents of a coordinate axis
-    or of a capsule's axis.
-
-    Args:
-      model: the model.
-      geoms: (C, 2), the geoms of each possible contact; a plane is the first.
+    It is also None if a tangent of one of the contacts (C, 2) may be neither in the
+    plane nor across it: the edges of its pyramid are then others. MuJoCo makes tangents
+    of a coordinate axis or of a capsule's axis.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -325,7 +308,8 @@ def _group(
     motion_normal: np.ndarray | None,
 ) -> Group:
     flat = motion_normal is not None and condim == 3
-    edges = _FLAT_PYRAMID if flat else _pyramid(condim)
+    elliptic = model.opt.cone == _ELLIPTIC and condim > 1
+    edges = _edges(condim, flat=flat, elliptic=elliptic)
     chosen = np.flatnonzero(contact.dim == condim)
     pairs, index = collision.pairs(
         model,
@@ -335,9 +319,7 @@ def _group(
     )
     index = chosen[index]
     body = model.geom_bodyid[contact.geoms[index]]
-    moves = np.zeros((model.nbody, model.nv))
-    for i in range(1, model.nbody):
-        moves[i] = moves[model.body_parentid[i]] + (model.dof_bodyid == i)
+    moves = tree.moves(model)
     is_body = np.eye(model.nbody) * (np.arange(model.nbody) > 0)
 
     def at(x: np.ndarray) -> np.ndarray:
@@ -353,7 +335,14 @@ def _group(
     reach = model.geom_rbound[contact.geoms[index]]
     turned = (model.body_invweight0[body, 1] * reach**2).sum(axis=1)
     moved = np.where(inverse_weight < 1e-4 * turned, turned, inverse_weight)
-    if condim > 1:
+    ratio = None
+    if elliptic:
+        # The weight of sliding is `impratio` times that of touching.
+        scale = max(model.opt.impratio, mujoco.mjMINVAL)
+        moved = moved * max(scale, 1.0)
+        ratio = sliding / np.float32(np.sqrt(scale))
+        friction = friction / ratio[:, None]
+    elif condim > 1:
         moved, inverse_weight = (x * (1 + sliding**2) for x in (moved, inverse_weight))
         inverse_weight = inverse_weight * 2 * sliding**2 / model.opt.impratio
         floor = floor * 2 * sliding**2 / model.opt.impratio
@@ -370,6 +359,7 @@ def _group(
         chain=(moves[body[:, 1]] - moves[body[:, 0]])[..., None].astype(np.float32),
         body=(is_body[body[:, 1]] - is_body[body[:, 0]])[..., None].astype(np.float32),
         friction=_constant(friction),
+        ratio=None if ratio is None else _constant(ratio),
         margin=_constant(contact.margin[index]),
         inverse_weight=_constant(inverse_weight),
         least_resistance=_constant(floor),
@@ -436,7 +426,7 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
         for i in (model.eq_obj1id[index], model.eq_obj2id[index])
     )
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         own, x = (
             constant_times(of_qpos[i], qpos) - start[i, None].astype(np.float32)
             for i in (first, second)
@@ -455,33 +445,18 @@ def _equalities(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     ), residual
 
 
-def _tendon_friction(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
-    index = np.flatnonzero(model.tendon_frictionloss)
-    if not index.size:
-        return None
-    of_qvel = tendons.fixed(model).of_qvel[index]
-
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return _wide(np.zeros(index.size), qpos), _wide(of_qvel, qpos)
-
-    solver = model.tendon_solref_fri[index], model.tendon_solimp_fri[index]
-    weight, loss = model.tendon_invweight0[index], model.tendon_frictionloss[index]
-    return Strength.of(model, weight, solver, loss), residual
-
-
 def _tendon_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
     index = np.flatnonzero(model.tendon_limited)
     if not index.size:
         return None
-    of_qpos, of_qvel = (x[index] for x in tendons.fixed(model))
     low, high = model.tendon_range[index].T[..., None].astype(np.float32)
     margin = model.tendon_margin[index, None].astype(np.float32)
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
-        length = constant_times(of_qpos, qpos)
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
+        length, jacobian = tendons.lengths(model, index, qpos, at)
         sign = jnp.where(length - low < high - length, 1.0, -1.0)
         distance = jnp.minimum(length - low, high - length) - margin
-        return distance, sign[:, None] * _wide(of_qvel, qpos)
+        return distance, sign[:, None] * jacobian
 
     solver = model.tendon_solref_lim[index], model.tendon_solimp_lim[index]
     return Strength.of(model, model.tendon_invweight0[index], solver), residual
@@ -493,7 +468,7 @@ def _ball_limits(model: mujoco.MjModel) -> tuple[Strength, Residual] | None:
         return None
     most = model.jnt_range[index].max(axis=1) - model.jnt_margin[index]
 
-    def residual(qpos: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def residual(qpos: jax.Array, at: Any) -> tuple[jax.Array, jax.Array]:
         angles, jacobians = [], []
         for joint in index:
             first, dof = model.jnt_qposadr[joint], model.jnt_dofadr[joint]
@@ -523,10 +498,15 @@ def friction_rows(friction: Strength, qvel: jax.Array) -> newton.JointRows:
 
 @jax.named_scope("constraint_rows")
 def other_rows(
-    strength: Strength, residual: Residual, qpos: jax.Array, *, qvel: jax.Array
+    strength: Strength,
+    residual: Residual,
+    at: tree.Kinematics,
+    *,
+    qpos: jax.Array,
+    qvel: jax.Array,
 ) -> newton.ContactRows:
     """Return rows of joints or tendons as contacts with one axis."""
-    distance, jacobian = residual(qpos)
+    distance, jacobian = residual(qpos, at)
     inverse_weight, solimp, bound = strength
     acts = distance < 0.0 if bound is None else jnp.ones_like(distance, bool)
     jacobian = materialize(jnp.where(acts[:, None], jacobian, 0.0))
@@ -597,11 +577,17 @@ def contact_rows(
     count = [
         2.0 if edges == _FLAT_PYRAMID and signs == (1, 0) else 1.0 for signs in edges
     ]
+    cone = None
+    if constants.ratio is not None:
+        ratio = jnp.broadcast_to(jnp.asarray(constants.ratio), weight.shape)
+        count, cone = [1.0], newton.Cone(ratio[:, None])
+    reference = speed * -constants.impedance.damping[:, None]
     return newton.ContactRows(
         basis=along,
-        reference=-constants.impedance.damping[:, None] * speed - pull[:, None],
+        reference=reference - pull[:, None] * signs[:, 0],
         weight=weight[:, None] * np.array(count, np.float32)[:, None],
         edges=edges,
+        bound=cone,
     )
 
 
@@ -615,16 +601,13 @@ def body_forces(
 ) -> jax.Array:
     """Return contacts' torque about `com` and force on each body, (N, 6, B).
 
-    Args:
-      edges: the group's edges.
-      contacts: the group's contacts.
-      com: (3, B), centre of mass of the tree, metres; (N, 3, B) of several trees.
-      edge_forces: (C, E, B), force along each edge.
+    `com` is as in `tree.Kinematics`, and `edge_forces` are (C, E, B).
     """
     (_, position, axes), constants = contacts
-    force = total(edge_forces, 1)[:, None] * axes[:, 0]
+    normal, *tangents = np.array(edges, np.float32).T
+    force = total(edge_forces * normal[:, None], 1)[:, None] * axes[:, 0]
     turn = None
-    for t, signs in enumerate(np.array(edges, np.float32).T[1:], 1):
+    for t, signs in enumerate(tangents, 1):
         friction = constants.friction[
             :, 0 if constants.friction.shape[1] == 1 else t - 1
         ]

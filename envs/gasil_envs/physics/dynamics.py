@@ -29,25 +29,16 @@ FIELDS = (
 
 
 class Dynamics(NamedTuple):
-    """A model, and the parts of its dynamics that do not depend on the state.
-
-    Attributes:
-      model: the model.
-      layout: layout of the constraints.
-      actuators: the actuators' constants.
-      tendons: the fixed tendons.
-      iterations: largest numbers of iterations of the solver and of a line search.
-      presses: whether float32 may lose digits of the constraints' forces.
-      fields: names of the fields to return, of `FIELDS`.
-    """
+    """A model, and the parts of its dynamics that do not depend on the state."""
 
     model: mujoco.MjModel
     layout: constraints.Layout
     actuators: actuators.Actuators
-    tendons: tendons.Tendons
+    tendons: tendons.Tendons  # The fixed tendons.
+    #: Largest numbers of iterations of the solver and of a line search.
     iterations: tuple[int, int]
-    presses: bool
-    fields: tuple[str, ...]
+    presses: bool  # Whether float32 may lose digits of the constraints' forces.
+    fields: tuple[str, ...]  # Names of the fields to return, of `FIELDS`.
 
 
 # From this stiffness of contacts on, and from this depth at the start in sizes of a
@@ -55,13 +46,10 @@ class Dynamics(NamedTuple):
 _STIFF, _DEEP = 20.0, 0.01
 #: Fields that are about the centre of mass of each body's own tree, with its base.
 _OF_ONE_TREE = ("cinert", "cvel", "cfrc_ext")
-
-
 _FLAGS = mujoco.mjtDisableBit
 _EULER, _RK4, _IMPLICITFAST = (
-    mujoco.mjtIntegrator.mjINT_EULER,
-    mujoco.mjtIntegrator.mjINT_RK4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    getattr(mujoco.mjtIntegrator, f"mjINT_{x}")
+    for x in ("EULER", "RK4", "IMPLICITFAST")
 )
 
 
@@ -81,10 +69,15 @@ def _enabled(model: mujoco.MjModel) -> mujoco.MjModel:
         _FLAGS.mjDSBL_ACTUATION: ("actuator_gainprm", "actuator_biasprm"),
     }
     disabled = [name for flag, x in names.items() if off & flag for name in x]
+    passive = _FLAGS.mjDSBL_SPRING | _FLAGS.mjDSBL_DAMPER
+    if off & passive == passive:
+        disabled.append("body_gravcomp")
     if disabled or off & _FLAGS.mjDSBL_GRAVITY:
         model = copy.copy(model)
         for name in disabled:
             getattr(model, name)[:] = 0
+        if "body_gravcomp" in disabled:
+            model.opt.density = model.opt.viscosity = 0.0
         if off & _FLAGS.mjDSBL_GRAVITY:
             model.opt.gravity[:] = 0.0
     return model
@@ -128,18 +121,11 @@ def make(
 
 
 class _Evaluation(NamedTuple):
-    """The result of one evaluation of the dynamics.
+    """The result of one evaluation of the dynamics."""
 
-    Attributes:
-      inertia: (V, V, B).
-      force: (V, B), all forces.
-      qacc: (V, B).
-      fields: the fields to return.
-    """
-
-    inertia: jax.Array
-    force: jax.Array
-    qacc: jax.Array
+    inertia: jax.Array  # (V, V, B).
+    force: jax.Array  # (V, B), all forces.
+    qacc: jax.Array  # (V, B).
     fields: Fields
 
 
@@ -197,7 +183,8 @@ def forward(
     if dynamics.layout.friction is not None:
         joints.append(constraints.friction_rows(dynamics.layout.friction, qvel))
     others = [
-        constraints.other_rows(*x, qpos, qvel=qvel) for x in dynamics.layout.others
+        constraints.other_rows(*x, at, qpos=qpos, qvel=qvel)
+        for x in dynamics.layout.others
     ]
     trees = tree.trees(model)
 
@@ -207,11 +194,7 @@ def forward(
             for group, x in zip(groups, contacts, strict=True)
         ]
         problem = newton.Problem(
-            smooth.inertia,
-            force,
-            state.qacc_warmstart,
-            tuple(joints),
-            (*rows, *others),
+            smooth.inertia, force, state.qacc_warmstart, tuple(joints), (*rows, *others)
         )
         solution = solver.solve_many(*dynamics.iterations, problem, for_speed=for_speed)
         of_bodies = jnp.zeros((model.nbody, 6, qpos.shape[-1]), jnp.float32)

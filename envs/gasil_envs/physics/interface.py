@@ -10,32 +10,20 @@ Fields = dict[str, jax.Array]
 
 
 class PhysicsState(struct.PyTreeNode):
-    """The complete state of a simulation: everything that the next step depends on.
+    """The complete state of a simulation: everything that the next step depends on."""
 
-    Attributes:
-      qpos: positions, float32 (nq,).
-      qvel: velocities, float32 (nv,).
-      qacc_warmstart: initial guess of the constraint solver, float32 (nv,).
-    """
-
-    qpos: jax.Array
-    qvel: jax.Array
-    qacc_warmstart: jax.Array
+    qpos: jax.Array  # Positions, float32 (nq,).
+    qvel: jax.Array  # Velocities, float32 (nv,).
+    qacc_warmstart: jax.Array  # Initial guess of the constraint solver, float32 (nv,).
 
 
 class Physics(Protocol):
     """Steps one model with pure functions, which work under `jax.jit` and `jax.vmap`.
 
     The constructor takes the names of the ``mjData`` arrays that are returned.
-
-    Attributes:
-      name: jax, mjx or mujoco.
     """
 
-    name: str
-
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
+    name: str  # jax, mjx or mujoco.
 
     def kinematics(self, state: PhysicsState) -> Fields:
         """Return the fields at `state`, with all forces 0."""

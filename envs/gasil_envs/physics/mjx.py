@@ -46,8 +46,7 @@ def left_out(model: mujoco.MjModel) -> str | None:
     for what, names in _LEFT_OUT.items():
         if any(np.any(getattr(model, name)) for name in names):
             return what
-    options = ("noslip_iterations", "disableactuator")
-    for option in options:
+    for option in ("noslip_iterations", "disableactuator"):
         if getattr(model.opt, option):
             return option
     flags = model.opt.enableflags & ~(_WITHOUT_EFFECT | _ENABLE.mjENBL_INVDISCRETE)
@@ -118,17 +117,9 @@ class Unsupported(ValueError):
 class MjxPhysics:
     """Steps a MuJoCo model with MJX's own step; see `interface.Physics`.
 
-    Args:
-      model: the model; its solver options are overwritten.
-      fields: names of the ``mjData`` arrays to return.
-      iterations: Newton iterations, default 8, or 30 if impratio is above 1.
-      ls_iterations: line-search steps, default 8. Float32 never meets MuJoCo's
-        tolerance, which is meant for float64, so that all of its 100 iterations would
-        run. 4 and 8 give the same result (relative error against C MuJoCo 6e-7 on
-        walker2d).
-
-    Raises:
-      Unsupported: if MJX does not take the model.
+    The model's solver options are overwritten: float32 never meets MuJoCo's tolerance,
+    which is meant for float64, so that all of its 100 iterations would run. 8 and 8, or
+    30 if impratio is above 1, are enough.
     """
 
     name = "mjx"
@@ -171,10 +162,6 @@ class MjxPhysics:
                 ", ".join(differs),
             )
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
-
     def _data(self, state: PhysicsState) -> Any:
         return self._blank_data.replace(
             qpos=state.qpos, qvel=state.qvel, qacc_warmstart=state.qacc_warmstart
@@ -190,7 +177,6 @@ class MjxPhysics:
     @partial(jax.jit, static_argnums=0)
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         mjx = _mjx()
         data = mjx.kinematics(self._model, self._data(state))
         data = mjx.com_pos(self._model, data)
@@ -200,7 +186,6 @@ class MjxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
         return self._step(state, control, frame_skip)
 
     # MJX takes seconds to trace this, which the check of the model needs too.
@@ -210,9 +195,7 @@ class MjxPhysics:
     ) -> tuple[PhysicsState, Fields]:
         mjx, data = _mjx(), self._data(state).replace(ctrl=control)
         data = jax.lax.scan(
-            lambda data, _: (mjx.step(self._model, data), None),
-            data,
-            length=frame_skip,
+            lambda data, _: (mjx.step(self._model, data), None), data, length=frame_skip
         )[0]
         state = PhysicsState(data.qpos, data.qvel, data.qacc_warmstart)
         if "cfrc_ext" in self._fields:

@@ -11,7 +11,7 @@ import concurrent.futures
 import itertools
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -26,26 +26,13 @@ from gasil_envs.physics.interface import Fields, PhysicsState
 _STATE = ("qpos", "qvel", "qacc_warmstart")
 
 
-class _Simulations(Protocol):
-    """A fixed number of simulations, for use by one thread at a time."""
-
-    def step(
-        self, inputs: dict[str, np.ndarray], frame_skip: int
-    ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        """Advance all simulations.
-
-        Args:
-          inputs: arrays of the state and "ctrl", (n, ...) each.
-          frame_skip: number of time steps.
-
-        Returns:
-          Arrays of the state and the fields, (n, ...) each, and whether each
-          simulation failed, bool (n,).
-        """
-
-
 class _BatchSimulations:
-    """Simulations with MuJoCo's own `mujoco.batch.Batch`, which returns no fields."""
+    """Simulations with MuJoCo's own `mujoco.batch.Batch`, which returns no fields.
+
+    A step is from arrays of the state and "ctrl", (n, ...) each, to those of the state
+    and the fields, and which simulations failed, bool (n,). One thread uses it at a
+    time.
+    """
 
     def __init__(self, model: mujoco.MjModel, count: int, threads: int):
         self._batch = mujoco.batch.Batch(model, count, threads)
@@ -68,7 +55,7 @@ class _BatchSimulations:
 
 
 class _ThreadedSimulations:
-    """Simulations with a thread and an `mujoco.MjData` for each share of them.
+    """The same with a thread and an `mujoco.MjData` for each share of them.
 
     They return fields, also contact forces, which `Batch` can't: ``cfrc_ext`` needs
     ``mj_rnePostConstraint`` after the step.
@@ -83,10 +70,10 @@ class _ThreadedSimulations:
         self._data = [mujoco.MjData(model) for _ in self._shares]
         self._pool = concurrent.futures.ThreadPoolExecutor(len(self._shares))
 
-        def shape(name: str) -> tuple[int, ...]:
-            return (count, *getattr(self._data[0], name).shape)
-
-        self._results = {name: np.zeros(shape(name)) for name in _STATE + self._fields}
+        self._results = {
+            name: np.zeros((count, *getattr(self._data[0], name).shape))
+            for name in _STATE + self._fields
+        }
         self._failed = np.zeros(count, bool)
 
     def _advance(
@@ -128,48 +115,32 @@ class _ThreadedSimulations:
 class MujocoPhysics:
     """Steps a MuJoCo model with C MuJoCo; see `interface.Physics`.
 
-    Args:
-      model: the model, with its own solver and integrator.
-      fields: names of the ``mjData`` arrays to return.
-      threads: number of threads of one host call; default the cores that this process
-        may use, divided by the local devices of JAX's default backend.
+    A host call has `threads`, by default the cores that this process may use, divided
+    by the local devices of JAX's default backend.
     """
 
     name = "mujoco"
 
     def __init__(
-        self,
-        model: mujoco.MjModel,
-        fields: Sequence[str] = (),
-        threads: int | None = None,
+        self, model: mujoco.MjModel, fields: Sequence[str] = (), threads: int = 0
     ):
         self._model, self._fields, self._threads = model, tuple(fields), threads
         data = mujoco.MjData(model)
-
-        def shape(name: str) -> tuple[int, ...]:
-            return getattr(data, name).shape
-
         self._at_rest = {x: getattr(data, x).copy() for x in (*_STATE, "ctrl")}
-        self._shapes = {name: shape(name) for name in (*_STATE, *self._fields)}
+        self._shapes = {x: getattr(data, x).shape for x in (*_STATE, *self._fields)}
         # By number of simulations. Devices call at the same time, and each call takes
         # its own simulations.
-        self._idle: dict[int, list[_Simulations]] = collections.defaultdict(list)
+        self._idle: dict[int, list[Any]] = collections.defaultdict(list)
         # Initial states are computed far more often than they are used, so they are
         # computed without a host call.
         self._place = batch_last(partial(dynamics.kinematics, model, self._fields))
 
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
-
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         return self._place(state)
 
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
         host_threads.check()
         cores = host_threads.available_cores()
         threads = self._threads or max(1, cores // jax.local_device_count())
@@ -177,17 +148,10 @@ class MujocoPhysics:
         def on_host(*arrays: Any) -> dict[str, np.ndarray]:
             return self._advance([np.asarray(x) for x in arrays], frame_skip, threads)
 
-        shapes = {
-            name: jax.ShapeDtypeStruct(shape, jnp.float32)
-            for name, shape in self._shapes.items()
-        }
         result = jax.pure_callback(
             on_host,
-            shapes,
-            state.qpos,
-            state.qvel,
-            state.qacc_warmstart,
-            control,
+            {x: jax.ShapeDtypeStruct(y, jnp.float32) for x, y in self._shapes.items()},
+            *(state.qpos, state.qvel, state.qacc_warmstart, control),
             vmap_method="broadcast_all",
         )
         state = PhysicsState(*(result[name] for name in _STATE))
@@ -206,7 +170,12 @@ class MujocoPhysics:
         try:
             simulations = idle.pop()
         except IndexError:
-            simulations = self._simulations(count, threads)
+            more = (self._model, count, threads)
+            simulations = (
+                _ThreadedSimulations(*more, self._fields)
+                if self._fields
+                else _BatchSimulations(*more)
+            )
         # MuJoCo would print a warning for each of these that it is given.
         lost = ~np.all([np.isfinite(x).all(axis=-1) for x in inputs.values()], axis=0)
         if lost.any():
@@ -224,8 +193,3 @@ class MujocoPhysics:
             results[name] = result.reshape(batch + shape)
         idle.append(simulations)
         return results
-
-    def _simulations(self, count: int, threads: int) -> _Simulations:
-        if self._fields:
-            return _ThreadedSimulations(self._model, count, threads, self._fields)
-        return _BatchSimulations(self._model, count, threads)

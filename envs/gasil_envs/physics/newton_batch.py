@@ -99,7 +99,7 @@ class _Batch:
     """A batch of problems, a `newton.System`.
 
     A vector is (V, B). Rows are a list: (V, B) for each of the joints' rows, then
-    (E, C, B) for each group of contacts.
+    (E, C, B) for each group of contacts, or a list of (C, B) if these have cones.
     """
 
     def __init__(self, problem: newton.Problem, for_speed: bool):
@@ -112,15 +112,15 @@ class _Batch:
 
         joints, contacts = problem.joints, problem.contacts
         self.force, self.warmstart = problem.force, problem.warmstart
-        self.reference = [x.reference for x in joints]
-        self.reference += [edges_first(group.reference) for group in contacts]
+        self._have_cones = [isinstance(x.bound, newton.Cone) for x in contacts]
+        self.reference: list[Any] = [x.reference for x in joints]
+        for group, has_cones in zip(contacts, self._have_cones, strict=True):
+            reference = edges_first(group.reference)
+            self.reference.append([*reference] if has_cones else reference)
         self.weight = [x.weight for x in joints]
         self.weight += [edges_first(group.weight) for group in contacts]
-        self.bound = [x.bound for x in joints]
-        self.bound += [
-            None if group.bound is None else edges_first(group.bound)
-            for group in contacts
-        ]
+        self.bound: list[Any] = [x.bound for x in joints]
+        self.bound += [jax.tree.map(edges_first, group.bound) for group in contacts]
         self._inertia, self._signs = problem.inertia, [x.sign for x in joints]
         self._edges = [group.edges for group in contacts]
         self._shapes = [group.basis.shape[:2] for group in contacts]
@@ -142,15 +142,16 @@ class _Batch:
     def inertia_times(self, vector: jax.Array) -> jax.Array:
         return _matvec(self._inertia, vector, self._spell_out_inertia)
 
-    def times(self, vector: jax.Array) -> list[jax.Array]:
-        result = [sign * vector for sign in self._signs]
+    def times(self, vector: jax.Array) -> list[Any]:
+        result: list[Any] = [sign * vector for sign in self._signs]
         if self._basis is not None:
             along = self._split(_matvec(self._basis, vector, self._spell_out))
-            for edges, axes in zip(self._edges, along, strict=True):
-                result.append(jnp.stack([sum_signed(axes, signs) for signs in edges]))
+            for edges, axes, has_cones in zip(self._edges, along, self._have_cones):
+                rows = [sum_signed(axes, signs) for signs in edges]
+                result.append(rows if has_cones else jnp.stack(rows))
         return result
 
-    def transposed_times(self, rows: list[jax.Array]) -> jax.Array:
+    def transposed_times(self, rows: list[Any]) -> jax.Array:
         result = add(map(operator.mul, self._signs, rows))
         of_groups = rows[len(self._signs) :]
         if self._basis is None:
@@ -163,12 +164,12 @@ class _Batch:
         joined = materialize(jnp.concatenate(along))
         return result + _matvec_transposed(self._basis, joined, self._spell_out)
 
-    def solve(self, active: list[jax.Array] | None, right: jax.Array) -> jax.Array:
+    def solve(self, active: list[Any] | None, right: jax.Array) -> jax.Array:
         if active is None:
             return eliminate(self._inertia, right)
         return eliminate(self._inertia + self._gram(active), right)
 
-    def _gram(self, weights: list[jax.Array]) -> jax.Array:
+    def _gram(self, weights: list[Any]) -> jax.Array:
         """J' diag(weights) J: -> (V, V, B)."""
         diagonal = add(sign**2 * x for sign, x in zip(self._signs, weights))
         of_groups = weights[len(self._signs) :]
@@ -177,7 +178,7 @@ class _Batch:
             return result
         weighted: list[jax.Array] = []
         for edges, of_edges, basis in zip(
-            self._edges, of_groups, self._split(self._basis), strict=True
+            self._edges, of_groups, self._split(self._basis)
         ):
             weighted += newton.weighted_axes(edges, of_edges, basis)
         joined = materialize(jnp.concatenate(weighted))
@@ -233,6 +234,8 @@ def solve_many(
     qacc, forces = newton.minimize(batch, iterations, line_search)
     return newton.Solution(
         qacc=qacc,
-        edge_forces=tuple(jnp.swapaxes(x, 0, 1) for x in forces[len(problem.joints) :]),
+        edge_forces=tuple(
+            jnp.swapaxes(jnp.asarray(x), 0, 1) for x in forces[len(problem.joints) :]
+        ),
         constraint_force=batch.transposed_times(forces),
     )

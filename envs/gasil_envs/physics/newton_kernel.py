@@ -154,18 +154,14 @@ class _Block:
     for each group of contacts.
     """
 
-    def __init__(self, refs: Any, size: int, edges: Sequence[Any], counts: Any) -> None:
+    def __init__(self, refs: Any, size: int, groups: Sequence[Any]) -> None:
         """Load a problem.
 
-        Args:
-          refs: references to the inertia, the force and the warm start, the vectors of
-            each of the joints' rows, and for each group to its axes (C, V) and its
-            edges' references, weights and bounds (C,).
-          size: number of degrees of freedom.
-          edges: each group's edges.
-          counts: each group's contacts.
+        `refs` are the inertia, force and warm start, the vectors of each of the joints'
+        rows, and each group's axes (C, V), references, weights and bounds (C,);
+        `groups` each group's edges, number of contacts and structure of its bounds.
         """
-        inertia, vectors, joints, groups = refs
+        inertia, vectors, joints, contacts = refs
         self.force, self.warmstart = (_load_vector(ref, size) for ref in vectors)
         loaded = [[_load_vector(ref, size) for ref in rows] for rows in joints]
         self.signs = [rows[0] for rows in loaded]
@@ -173,17 +169,17 @@ class _Block:
         self.weight: list[Any] = [rows[2] for rows in loaded]
         # Those of limits have no bound.
         self.bound: list[Any] = [(*rows, None)[3] for rows in loaded]
-        self._size, self._edges = size, edges
+        self._size, self._edges = size, [edges for edges, *_ in groups]
         self._inertia = _loads_of_matrix(inertia, size)
         # For each group a list of axes, each a list of parts (C, W).
         self._basis: list[list[list[Load]]] = []
-        for (axes, *of_edges), count in zip(groups, counts, strict=True):
+        for (axes, *of_edges), (_, count, structure) in zip(contacts, groups):
             references, weights, *bound = [
                 [_load(x, count) for x in values] for values in of_edges
             ]
             self.reference.append(references)
             self.weight.append(weights)
-            self.bound.append(bound[0] if bound else None)
+            self.bound.append(jax.tree.unflatten(structure, bound))
             self._basis.append(
                 [
                     [
@@ -221,9 +217,7 @@ class _Block:
     def transposed_times(self, rows: list[Any]) -> list[jax.Array]:
         result = _sum(map(_multiply, self.signs, rows))
         of_groups = rows[len(self.signs) :]
-        for edges, axes, of_edges in zip(
-            self._edges, self._basis, of_groups, strict=True
-        ):
+        for edges, axes, of_edges in zip(self._edges, self._basis, of_groups):
             along = [sum_signed(of_edges, signs) for signs in zip(*edges, strict=True)]
             for i in range(len(result)):
                 terms = [
@@ -248,9 +242,7 @@ class _Block:
         for row, entry in zip(matrix, own, strict=True):
             entries = jnp.broadcast_to(entry[:, None], diagonal.shape)
             row[0] = row[0] + jnp.where(diagonal, entries, 0.0)
-        for edges, axes, of_edges in zip(
-            self._edges, self._basis, of_groups, strict=True
-        ):
+        for edges, axes, of_edges in zip(self._edges, self._basis, of_groups):
             for i, row in enumerate(matrix):
                 weighted = newton.weighted_axes(
                     edges, of_edges, [parts[i]() for parts in axes]
@@ -326,21 +318,14 @@ def _call(
     specs: Any,
     results: Any,
     *,
-    warps: int = 1,
     interpret: bool,
+    warps: int = 1,
 ) -> Any:
-    """Call a kernel for each problem.
+    """Call a kernel for each problem; the first axis of its results is the batch.
 
-    Args:
-      kernel: function of the references to `arrays`, and to each of the results.
-      arrays: tree of arrays whose last axis is the batch.
-      specs: the same tree of specifications of a block's padded part of them.
-      results: specifications of the results; each of them is a whole padded array.
-      warps: number of warps of a block.
-      interpret: run the kernel as XLA's operations, on any device.
-
-    Returns:
-      The results, whose first axis is the batch.
+    `arrays` are a tree whose last axis is the batch, `specs` the same tree of their
+    padded parts that a block has, and `results` the specifications of what it returns.
+    With `interpret` it runs as XLA's operations, on any device.
     """
     from jax.experimental import pallas as pl
     from jax.experimental.pallas import triton
@@ -376,10 +361,7 @@ def solve_many(
     *,
     interpret: bool = False,
 ) -> newton.Solution:
-    """Solve a batch of problems as `solver.solve_many` does.
-
-    With `interpret` the kernel runs as XLA's operations, on any device, to test it.
-    """
+    """Solve a batch of problems as `solver.solve_many` does."""
     size = problem.force.shape[0]
     padded = len(_parts(size)) * WIDTH
     joints = list(map(jax.tree.leaves, problem.joints))
@@ -387,30 +369,28 @@ def solve_many(
     groups, of_groups, of_edges, entries = [], [], [], 0
     for group, count in zip(problem.contacts, counts, strict=True):
         arrays = [group.basis, group.reference, group.weight]
-        arrays += [] if group.bound is None else [group.bound]
+        arrays += jax.tree.leaves(group.bound)
         groups.append([list(jnp.moveaxis(x, 1, 0)) for x in arrays])
         contacts = max(_FEWEST_CONTACTS, 1 << (count - 1).bit_length())
         axes, edges = group.basis.shape[1], len(group.edges)
         of_edges.append([_spec(contacts)] * edges)
-        per_edge = [of_edges[-1]] * (len(arrays) - 1)
+        per_edge = [[_spec(contacts)] * x.shape[1] for x in arrays[1:]]
         of_groups.append([[_spec(contacts, padded)] * axes, *per_edge])
         entries += axes * contacts * padded
     read = functools.partial(
         _Block,
         size=size,
-        edges=[group.edges for group in problem.contacts],
-        counts=counts,
+        groups=[
+            (x.edges, len(x.basis), jax.tree.structure(x.bound))
+            for x in problem.contacts
+        ],
     )
     vector = _spec(padded)
+    of_joints = [[vector] * len(rows) for rows in joints]
     qacc, constraint_force, forces = _call(
         functools.partial(_newton, read, iterations, line_search),
         (problem.inertia, [problem.force, problem.warmstart], joints, groups),
-        (
-            _spec(padded, padded),
-            [vector] * 2,
-            [[vector] * len(rows) for rows in joints],
-            of_groups,
-        ),
+        (_spec(padded, padded), [vector] * 2, of_joints, of_groups),
         [vector, vector, of_edges],
         warps=1 << max(0, (entries // _ENTRIES_OF_A_WARP).bit_length() - 1),
         interpret=interpret,
@@ -428,13 +408,7 @@ def solve_many(
 def eliminate_many(
     matrix: jax.Array, right: jax.Array, *, interpret: bool = False
 ) -> jax.Array:
-    """Return x of A x = b for symmetric positive A: (V, V, B), (V, B) -> (V, B).
-
-    Args:
-      matrix: A.
-      right: b.
-      interpret: run the kernel as XLA's operations, on any device, to test it.
-    """
+    """Return x of A x = b for symmetric positive A: (V, V, B), (V, B) -> (V, B)."""
     size = right.shape[0]
     padded = len(_parts(size)) * WIDTH
     specs = (_spec(padded, padded), _spec(padded))

@@ -6,10 +6,9 @@ from functools import partial
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 
-from gasil_envs.physics import dynamics, tree
+from gasil_envs.physics import dynamics, tendons, tree
 from gasil_envs.physics.batching import batch_last, in_tiles
 from gasil_envs.physics.interface import Fields, Physics, PhysicsState
 from gasil_envs.physics.mjx import MjxPhysics, Unsupported, left_out
@@ -29,11 +28,7 @@ def ours_or_mjx(
     iterations: int | None = None,
     ls_iterations: int | None = None,
 ) -> Physics:
-    """Return our physics, or MJX's and a warning that says which part ours lacks.
-
-    Raises:
-      ValueError: if neither takes the model.
-    """
+    """Return our physics, or MJX's and a warning that says which part ours lacks."""
     reason = unsupported(model)
     if reason is None:
         return JaxPhysics(model, fields, iterations, ls_iterations)
@@ -53,15 +48,9 @@ def ours_or_mjx(
 
 
 class JaxPhysics:
-    """Steps a MuJoCo model with our dynamics and solver; see `interface.Physics`.
+    """Steps a supported model with our dynamics and solver; see `interface.Physics`.
 
-    Args:
-      model: a model that `unsupported` has nothing against.
-      fields: names of the ``mjData`` arrays to return.
-      iterations: largest number of Newton iterations, default 100: it ends where it has
-        converged, mostly after 2 to 8.
-      ls_iterations: largest number of steps of each line search, default 16, or 4 if
-        iterations are given.
+    Newton's method ends where it has converged, mostly after 2 to 8 iterations.
     """
 
     name = "jax"
@@ -85,22 +74,19 @@ class JaxPhysics:
 
     @property
     def warnings(self) -> list[str]:
-        """Return the parts of the model that float32 resolves too little of."""
+        """Return what differs: of the model, mostly what float32 does not resolve."""
         own, parts = self._dynamics, []
         if own.layout.stiffness > 3e3:
             parts.append(
                 f"contacts, which are {own.layout.stiffness:.0e} times as stiff as "
                 "what they move (by friction, impratio or solimp)"
             )
+        if "cfrc_ext" in own.fields and tendons.strings(own.model).any():
+            parts.append("cfrc_ext, which is without the forces of spatial tendons")
         return parts + tree.rounding(own.model)
-
-    def init(self, qpos: jax.Array, qvel: jax.Array) -> PhysicsState:
-        """Return the state at positions (nq,) and velocities (nv,), warm start 0."""
-        return PhysicsState(qpos, qvel, jnp.zeros_like(qvel))
 
     @full_precision
     def kinematics(self, state: PhysicsState) -> Fields:
-        """Return the fields at `state`, with all forces 0."""
         own = self._dynamics
         place = partial(dynamics.kinematics, own.model, own.fields)
         return batch_last(place)(state)
@@ -109,7 +95,6 @@ class JaxPhysics:
     def step(
         self, state: PhysicsState, control: jax.Array, frame_skip: int
     ) -> tuple[PhysicsState, Fields]:
-        """Advance `frame_skip` time steps under one control (nu,)."""
 
         def many(x: Any) -> Any:
             return dynamics.step(self._dynamics, x[0], x[1], frame_skip)

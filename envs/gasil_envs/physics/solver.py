@@ -14,16 +14,11 @@ def solve_many(
     *,
     for_speed: bool = True,
 ) -> newton.Solution:
-    """Solve a batch of problems.
+    """Solve a batch of problems, the last axis of all arrays.
 
-    Args:
-      iterations: largest number of Newton iterations.
-      line_search: largest number of steps of each line search.
-      problem: the problems; every array has one more axis, the batch, at its end.
-      for_speed: whether a CPU's program is unrolled for speed or compiled for size.
-
-    Returns:
-      The solutions, with the batch as the last axis of every array.
+    `iterations` and `line_search` are the largest numbers of Newton's iterations and of
+    steps of each line search. A CPU's program is unrolled for speed or compiled for
+    size.
     """
     if has_triton():
         return newton_kernel.solve_many(iterations, line_search, problem)

@@ -20,14 +20,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from gasil_envs.physics.batching import (
-    add,
-    constant_times,
-    materialize,
-    stacked,
-    take,
-    total,
-)
+from gasil_envs.physics.batching import add, materialize, stacked, take, total
 
 FREE, BALL, SLIDE, HINGE = (
     int(mujoco.mjtJoint.mjJNT_FREE),
@@ -41,40 +34,37 @@ _NEGLIGIBLE = 1e-9
 _FAR, _FAR_IN_SIZES, _UNEVEN = 20.0, 100.0, 800.0
 
 
+def moves(model: mujoco.MjModel) -> np.ndarray:
+    """Return 1 where a degree of freedom moves a body, else 0, (N, V)."""
+    result = np.zeros((model.nbody, model.nv))
+    for body in range(1, model.nbody):
+        result[body] = result[model.body_parentid[body]] + (model.dof_bodyid == body)
+    return result
+
+
 class Kinematics(NamedTuple):
-    """Positions in the world's frame, metres.
+    """Positions in the world's frame, metres."""
 
-    Attributes:
-      columns: rotation of each body.
-      xpos: (N, 3, B), origins of the bodies.
-      xipos: (N, 3, B), their centres of mass.
-      com: (3, B), centre of mass of all bodies that move; of each body's tree if there
-        are several, (N, 3, B).
-      cinert: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass
-        times offset, mass.
-      cdof: (V, 6, B), motion of one unit of each velocity.
-    """
-
-    columns: list[list[jax.Array]]
-    xpos: jax.Array
-    xipos: jax.Array
+    columns: list[list[jax.Array]]  # Rotation of each body.
+    xpos: jax.Array  # (N, 3, B), origins of the bodies.
+    xipos: jax.Array  # (N, 3, B), their centres of mass.
+    #: (3, B), centre of mass of all bodies that move; of each body's tree if there are
+    #: several, (N, 3, B).
     com: jax.Array
+    #: (N, 10, B), inertia of each body about `com`: xx, yy, zz, xy, xz, yz, mass times
+    #: offset, mass.
     cinert: jax.Array
-    cdof: jax.Array
+    cdof: jax.Array  # (V, 6, B), motion of one unit of each velocity.
 
 
 def unsupported(model: mujoco.MjModel) -> str | None:
     """Return why these functions do not describe this model, or None if they do."""
     if model.jnt_actgravcomp.any():
         return "it has gravity compensated by actuators"
+    if model.jnt_stiffness[model.jnt_type <= BALL].any():
+        return "it has springs of balls or free joints"
     if model.opt.wind.any() or (model.geom_fluid[:, 0] > 0).any():
         return "it has wind or the ellipsoid model of fluids"
-    flags = mujoco.mjtDisableBit
-    passive = flags.mjDSBL_SPRING | flags.mjDSBL_DAMPER
-    others = model.opt.density > 0 or model.opt.viscosity > 0
-    others = others or model.body_gravcomp.any()
-    if model.opt.disableflags & passive == passive and others:
-        return "its medium or compensation is disabled with its springs and dampers"
     return None
 
 
@@ -288,9 +278,7 @@ def _inertia(
     local = np.stack(
         [
             _matrix(quaternion) * inertia @ _matrix(quaternion).T
-            for quaternion, inertia in zip(
-                model.body_iquat, model.body_inertia, strict=True
-            )
+            for quaternion, inertia in zip(model.body_iquat, model.body_inertia)
         ]
     ).astype(np.float32)[..., None, None]
     # local is symmetric: row j of (local @ rotation') is the sum over its columns.
@@ -382,17 +370,11 @@ def _sum_up(model: mujoco.MjModel, of_body: jax.Array) -> list[jax.Array]:
 
 
 class Smooth(NamedTuple):
-    """The dynamics without constraints.
+    """The dynamics without constraints."""
 
-    Attributes:
-      inertia: (V, V, B), the joint-space inertia.
-      force: (V, B), passive forces less bias forces.
-      cvel: (N, 6, B), velocity of each body.
-    """
-
-    inertia: jax.Array
-    force: jax.Array
-    cvel: jax.Array
+    inertia: jax.Array  # (V, V, B), the joint-space inertia.
+    force: jax.Array  # (V, B), passive forces less bias forces.
+    cvel: jax.Array  # (N, 6, B), velocity of each body.
 
 
 def velocity(model: mujoco.MjModel, cdof: jax.Array, qvel: jax.Array) -> jax.Array:
@@ -425,8 +407,6 @@ def smooth(
     bias = total(cdof * moved[:, 10:], 1)
     passive = -model.dof_damping.astype(np.float32)[:, None] * qvel
     scalar = model.jnt_type > BALL
-    for joint in np.flatnonzero(model.jnt_stiffness * ~scalar):
-        passive = passive - _turned_spring(model, int(joint), qpos)
     if model.jnt_stiffness[scalar].any():
         index = model.jnt_qposadr[scalar]
         stretch = (
@@ -441,34 +421,15 @@ def smooth(
     return Smooth(_joint_inertia(model, unit_momentum, cdof), passive - bias, cvel)
 
 
-def _turned_spring(model: mujoco.MjModel, joint: int, qpos: jax.Array) -> jax.Array:
-    """Return minus the force (V, B) of the spring of a free joint or a ball."""
-    first, dof, parts = model.jnt_qposadr[joint], model.jnt_dofadr[joint], []
-    if model.jnt_type[joint] == FREE:
-        rest = model.qpos_spring[first : first + 3].astype(np.float32)
-        parts.append(qpos[first : first + 3] - rest[:, None])
-        first += 3
-    # From the spring's orientation to the joint's.
-    w, x, y, z = model.qpos_spring[first : first + 4]
-    back = np.array([[w, x, y, z], [-x, w, z, -y], [-y, -z, w, x], [-z, y, -x, w]])
-    axis, angle = axis_angle(constant_times(back, qpos[first : first + 4]))
-    stretch = jnp.concatenate([*parts, axis * angle])
-    none = jnp.zeros((model.nv, qpos.shape[-1]), jnp.float32)
-    return float(model.jnt_stiffness[joint]) * jnp.concatenate(
-        [none[:dof], stretch, none[dof + len(stretch) :]]
-    )
-
-
 def _joint_inertia(
     model: mujoco.MjModel, unit_momentum: jax.Array, cdof: jax.Array
 ) -> jax.Array:
     """Return the inertia (V, V, B), from the momentum of each unit motion (V, 6, B)."""
     above = np.zeros((model.nv, model.nv, 1), bool)
-    for dof in range(model.nv):
-        ancestor = model.dof_parentid[dof]
-        while ancestor >= 0:
-            above[dof, ancestor] = True
-            ancestor = model.dof_parentid[ancestor]
+    for dof, parent in enumerate(model.dof_parentid):
+        if parent >= 0:
+            above[dof] = above[parent]
+            above[dof, parent] = True
     product = add(unit_momentum[:, None, k] * cdof[None, :, k] for k in range(6))
     product = materialize(product)
     own = np.eye(model.nv, dtype=bool)[..., None]

@@ -1,6 +1,7 @@
-"""Our environments as Gymnasium's, checked by Gymnasium."""
+"""Our environments under the interfaces of Gymnasium and gymnax."""
 
 import multiprocessing
+import sys
 
 import gymnasium
 import jax
@@ -164,21 +165,15 @@ def test_a_forked_process_is_refused(make):
 
 
 @SINGLE_AND_BATCH
-def test_info_has_the_same_entries_after_a_reset_and_a_step(make):
+def test_a_wrong_use_is_told_and_info_has_the_same_entries_after_reset_and_step(make):
     env = make()
+    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
+        env.step(env.action_space.sample())
     _, first = env.reset(seed=0)
     *_, then = env.step(env.action_space.sample())
     describe = lambda info: {key: (type(x), np.shape(x)) for key, x in info.items()}
     assert describe(first) == describe(then)
     assert not np.any(first["true_reward"])
-
-
-@SINGLE_AND_BATCH
-def test_a_wrong_use_is_told(make):
-    env = make()
-    with pytest.raises(gymnasium.error.ResetNeeded, match="needs a reset"):
-        env.step(env.action_space.sample())
-    env.reset(seed=0)
     with pytest.raises(ValueError, match=r"action has shape \(5, 2\): it must have \("):
         env.step(np.zeros((5, 2)))
 
@@ -230,3 +225,71 @@ def test_a_step_of_failed_physics_terminates_in_every_adapter():
         )
         assert info["final_observation"] == min(count, 2) and reward == (count < 3)
         assert terminated == (count == 3) and not truncated
+
+
+SETTINGS = {"reward_delay": 7, "obs_noise": 0.1}
+
+
+def rollout(env, reset_key, keys):
+    """The start, the last state, and what each step gives and was given; one scan."""
+
+    def step(carry, key):
+        observation, state = carry
+        action = jnp.sin(jnp.arange(2.0) + 9.0 * observation[:2])
+        observation, state, *rest = env.step(key, state, action, env.default_params)
+        return (observation, state), (action, observation, *rest)
+
+    start = env.reset(reset_key, env.default_params)
+    return start, *jax.lax.scan(step, start, keys)
+
+
+def test_episodes_are_those_of_our_environment():
+    env = GymnaxEnv("point_mass", **SETTINGS)
+    ours = gasil_envs.make("point_mass", **SETTINGS)
+    step, reset = jax.jit(ours.step), jax.jit(ours.reset)
+    keys = jax.random.split(jax.random.key(0), 120)
+    (first, _), _, steps = jax.jit(lambda *x: rollout(env, *x))(jax.random.key(1), keys)
+    state = reset(jax.random.key(1))
+    np.testing.assert_allclose(first, state.obs, atol=1e-6)
+    for i, key in enumerate(keys):
+        action, observation, reward, terminated, truncated, info = jax.tree.map(
+            lambda x, i=i: x[i], steps
+        )
+        stepped = step(state, action)
+        np.testing.assert_allclose(info["final_observation"], stepped.obs, atol=1e-5)
+        np.testing.assert_allclose(reward, stepped.reward, atol=1e-5)
+        true_reward = stepped.info["true_reward"]
+        np.testing.assert_allclose(info["true_reward"], true_reward, atol=1e-5)
+        assert not terminated and bool(truncated) == (i % 50 == 49)
+        state = reset(key) if truncated else stepped
+        np.testing.assert_allclose(observation, state.obs, atol=1e-5)
+
+
+def test_gymnax_own_wrappers_take_it():
+    wrappers = pytest.importorskip("gymnax.wrappers")
+    env = GymnaxEnv("point_mass", **SETTINGS)
+    params = env.default_params
+    space = env.action_space(params)
+    assert space.shape == (2,) and space.contains(space.sample(jax.random.key(0)))
+    flat = wrappers.FlattenObservationWrapper(env)
+    assert flat.observation_space(params).shape == (11,)
+    logged = wrappers.LogWrapper(flat)
+    keys = jax.random.split(jax.random.key(0), 120)
+    roll = jax.vmap(lambda key: rollout(logged, key, keys))
+    _, _, steps = jax.jit(roll)(jax.random.split(jax.random.key(1), 2))
+    *_, rewards, _, truncated, info = steps
+    ends = np.flatnonzero(info["returned_episode"][0])
+    assert ends.tolist() == np.flatnonzero(truncated[0]).tolist() == [49, 99]
+    assert info["returned_episode_lengths"][:, ends].tolist() == [[50, 50]] * 2
+    for first, end in zip((0, 50), ends):
+        np.testing.assert_allclose(
+            info["returned_episode_returns"][:, end],
+            rewards[:, first : end + 1].sum(axis=1),
+            atol=1e-4,
+        )
+
+
+def test_a_missing_package_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gymnax.environments", None)
+    with pytest.raises(ImportError, match=r"pip install \"gasil_jax\[gymnax\]\""):
+        GymnaxEnv("point_mass").action_space()
