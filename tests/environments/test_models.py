@@ -63,6 +63,11 @@ MODELS = {
         world=f"""<body pos="-.25 -.05 .2"><freejoint/><geom size=".15"/></body>
         <body pos=".05 .2 .53" euler="0 70 0"><freejoint/><geom {CAPSULE}/></body>""",
     ),
+    "capsule lying on a cylinder": """<mujoco><worldbody>
+        <geom type="cylinder" size="0.3 0.1"/><body pos="0.1 0.05 0.36">
+        <joint type="slide" axis="0 0 1"/><joint axis="0 0 1"/><joint axis="0 1 0"/>
+        <geom type="capsule" size="0.3 0.25" euler="0 88 0"/></body></worldbody>
+        </mujoco>""",
     "pair": drop(
         CAPSULE + ' contype="0" conaffinity="0"',
         more="""<contact><pair geom1="it" geom2="ground" condim="6" solref="0.03 1"
@@ -152,6 +157,12 @@ MODELS = {
         name="a" damping="1e-8" pos="0.01 0 0"/><geom type="capsule" condim="6"
         size="0.01 0.01" mass="0.001"/></body></worldbody><actuator>
         <motor joint="a" ctrlrange="-1 1"/></actuator></mujoco>""",
+    # Its accelerations are right, though those of the other need much larger forces.
+    "light beside heavy": """<mujoco><option impratio="20"/><worldbody>
+        <geom type="plane" size="1 1 1"/><body pos="0 0 0.1" euler="0 80 0">
+        <joint type="ball" pos="0.05 0.1 0.02"/><geom type="capsule" size="0.3 0.3"
+        mass="1e6"/></body><body pos="1 0 0.02" euler="0 85 20"><freejoint/>
+        <geom type="capsule" size="0.05 0.05"/></body></worldbody></mujoco>""",
     "strings": drop(
         'size="0.1"/><site name="a" pos="0.05 0.02 0.08"',
         world="""<site name="w" pos="0 0.3 0.5"/><body pos="1 0 1"><joint axis="1 2 0"

@@ -2,9 +2,10 @@
 
 A sphere is a capsule of length 0, and each end of a capsule meets a plane as a sphere.
 Boxes, cylinders and ellipsoids meet planes in points, a box meets a sphere, and a
-cylinder spheres and capsules. The formulas are C MuJoCo's (but for a capsule whose axis
-is inside a cylinder, which C pushes out another way), and every array has the batch as
-its last axis. Two things differ from MJX:
+cylinder spheres and capsules, of which a lying one touches its disk twice. The formulas
+are C MuJoCo's (but for a capsule whose axis is inside a cylinder, which C pushes out
+another way), and every array has the batch as its last axis. Two things differ from
+MJX:
 
 - The tangent of a capsule on a plane is the capsule's axis, however steep it is, as in
   C MuJoCo. MJX takes a fixed tangent above 60 degrees. The pyramidal friction cone, and
@@ -54,9 +55,10 @@ class Pairs:
     #: (2, k), planes and other geoms; all points of a pair follow each other.
     points: np.ndarray
     between: np.ndarray  # (2, m), spheres and capsules.
-    #: (2, l), spheres or capsules and boxes or cylinders. Contacts are in the order of
-    #: these four.
+    #: (2, l), spheres or capsules and boxes or cylinders; a capsule that can lie on a
+    #: cylinder is there twice. Contacts are in the order of these four.
     solids: np.ndarray
+    margin: np.ndarray  # (l,), distance in metres from which these are in play.
     num_tangents: int  # Number of tangents of a contact.
     #: (3,), the normal of the plane that all motion is in, or None.
     motion_normal: np.ndarray | None
@@ -82,6 +84,7 @@ def pairs(
     geoms: np.ndarray,
     num_tangents: int,
     *,
+    margin: np.ndarray,
     motion_normal: np.ndarray | None,
 ) -> tuple[Pairs, np.ndarray]:
     """Return the contacts of pairs (P, 2), and which pair each contact is of, (C,)."""
@@ -95,6 +98,8 @@ def pairs(
     end = np.where(second[on_plane] == _CAPSULE, np.where(is_second, -1.0, 1.0), 0.0)
     points = np.repeat(number, count * (plane & ~rounded))
     between, solids = number[~plane & rounded], number[~plane & ~rounded]
+    if not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_MULTICCD:
+        solids = np.repeat(solids, np.where(first[solids] == _CAPSULE, 2, 1))
     index = np.concatenate([on_plane, points, between, solids])
     every = Pairs(
         on_plane=geoms[on_plane].T,
@@ -102,6 +107,7 @@ def pairs(
         points=geoms[points].T,
         between=geoms[between].T,
         solids=geoms[solids].T,
+        margin=margin[solids],
         num_tangents=num_tangents,
         motion_normal=motion_normal,
     )
@@ -317,7 +323,11 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
     distances: list[jax.Array] = []
     positions: list[jax.Array] = []
     normals: list[jax.Array] = []
-    for geom, solid in pairs.solids.T:
+    every, first, counts = np.unique(
+        pairs.solids, axis=1, return_index=True, return_counts=True
+    )
+    for i in np.argsort(first):
+        geom, solid = every[:, i]
         columns, up = lines.columns[solid], np.eye(3, dtype=np.float32)[..., None]
         size = model.geom_size[solid].astype(np.float32)[:, None]
         is_round = model.geom_type[solid] == _CYLINDER
@@ -326,6 +336,7 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
             stacked([total(column * x) for column in columns])
             for x in (lines.middle[geom] - lines.middle[solid], lines.half[geom])
         )
+        middle = centre
         if model.geom_type[geom] == _CAPSULE:
             centre = _nearest_on_line(nearest, centre, half)
         away = nearest(centre) - centre
@@ -346,12 +357,79 @@ def _touch_solids(model: mujoco.MjModel, pairs: Pairs, lines: Segments) -> Touch
         distance = jnp.where(inside, -depth, apart)
         normal = jnp.where(inside, inwards, away / jnp.maximum(apart, 1e-7))
         position = centre + normal * (0.5 * (radius + distance))
-        distances.append(distance - radius)
-        for x, results in ((position, positions), (normal, normals)):
-            results.append(add(x[i] * columns[i] for i in range(3)))
-        positions[-1] = positions[-1] + lines.middle[solid]
+        points = [(distance - radius, position, normal)]
+        if counts[i] == 2:
+            on_disk = (jnp.abs(centre[2]) > size[1]) & ~inside
+            points = _lying(
+                points[0],
+                (middle, half),
+                size=size,
+                radius=radius,
+                margin=float(pairs.margin[first[i]]),
+                on_disk=on_disk,
+            )
+        for distance, position, normal in points:
+            distances.append(distance)
+            for x, results in ((position, positions), (normal, normals)):
+                results.append(add(x[i] * columns[i] for i in range(3)))
+            positions[-1] = positions[-1] + lines.middle[solid]
     axes = _frames(pairs, stacked(normals))
     return Touch(stacked(distances), stacked(positions), axes)
+
+
+# C takes a capsule to lie on a disk up to this angle, and 16 edges for the disk's own.
+_LYING = float(np.sin(0.0889))
+_EDGES = [(np.cos(x), np.sin(x)) for x in (np.arange(8) + 0.5) * np.pi / 8]
+_Point = tuple[jax.Array, jax.Array, jax.Array]
+
+
+def _lying(
+    one: _Point,
+    line: tuple[jax.Array, jax.Array],
+    *,
+    size: np.ndarray,
+    radius: float,
+    margin: float,
+    on_disk: jax.Array,
+) -> list[_Point]:
+    """Return two contacts, (distance, position, normal), of a capsule and a cylinder.
+
+    If the capsule lies on a disk, they are the ends of its line (middle, half), moved
+    to its surface and cut off at the edge of the disk; else they are `one` and none.
+    """
+    (middle, half), (distance, position, normal) = line, one
+    square = jnp.maximum(total(half**2), 1e-30)
+    aside = (radius + 0.5 * margin) * normal
+    middle = middle + aside - half * (total(aside * half) / square)
+    low, high = -jnp.ones_like(distance), jnp.ones_like(distance)
+    most = float(size[0, 0] * np.cos(np.pi / 16))
+    for edge in _EDGES:
+        at, rate = (
+            add(float(e) * x[i] for i, e in enumerate(edge)) for x in (middle, half)
+        )
+        rate = jnp.where(jnp.abs(rate) < 1e-15, 1e-15, rate)
+        crossings = (-most - at) / rate, (most - at) / rate
+        low = jnp.maximum(low, jnp.minimum(*crossings))
+        high = jnp.minimum(high, jnp.maximum(*crossings))
+    up = jnp.where(position[2] > 0.0, 1.0, -1.0)
+    ends = [middle + low * half, middle + high * half]
+    heights = [up * end[2] - size[1] + 0.5 * margin for end in ends]
+    lies = on_disk & (jnp.abs(half[2]) < _LYING * jnp.sqrt(square)) & (low <= high)
+    near = [lies & (height <= margin) for height in heights]
+
+    def contact(own: int) -> _Point:
+        height = jnp.where(near[own], heights[own], heights[1 - own])
+        x, y, _ = jnp.where(near[own], ends[own], ends[1 - own])
+        place = jnp.stack([x, y, up * (size[1] + 0.5 * height)])
+        down = jnp.stack([0.0 * up, 0.0 * up, -up])
+        mine = zip((height, place, down), one, strict=True)
+        a, b, c = (jnp.where(near[0] | near[1], x, y) for x, y in mine)
+        return a, b, c
+
+    first, second = contact(0), contact(1)
+    # An end that is cut off counts twice where the other one is too far.
+    is_two = near[0] & near[1] | near[0] & (low > -1.0) | near[1] & (high < 1.0)
+    return [first, (jnp.where(is_two, second[0], jnp.inf), *second[1:])]
 
 
 def _length(x: jax.Array) -> jax.Array:

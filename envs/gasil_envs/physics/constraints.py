@@ -315,6 +315,7 @@ def _group(
         model,
         contact.geoms[chosen],
         min(len(edges[0]) - 1, 2),
+        margin=contact.margin[chosen],
         motion_normal=motion_normal,
     )
     index = chosen[index]

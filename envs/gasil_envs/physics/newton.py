@@ -350,7 +350,8 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
     def iterate(carry: Any) -> Any:
         qacc, jaref = carry
         residual = each(jnp.subtract, system.inertia_times(qacc), system.force)
-        pull = system.transposed_times(of_rows(_derivative, jaref))
+        derivative = of_rows(_derivative, jaref)
+        pull = system.transposed_times(derivative)
         active, gradient = system.store(
             (of_rows(_curvature, jaref), each(jnp.add, residual, pull))
         )
@@ -358,7 +359,7 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
 
         # phi(s) = cost(qacc + s direction); phi' is increasing and piecewise linear.
         slope = system.store(system.times(direction))
-        linear = dot(direction, residual)
+        linear = dot(direction, gradient if thorough else residual)
         quadratic = dot(direction, system.inertia_times(direction))
         size = dot(smooth, system.force)
         size += dot(qacc, each(jnp.add, residual, system.force))
@@ -372,7 +373,11 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             (step, is_newton), low, high, before = search
             there = each(lambda d, s: d + step * s, jaref, slope)
             second = quadratic + system.total(of_rows(_bend, there, slope))
-            rates = of_rows(_rate, there, slope)
+            if thorough:  # Large forces that balance each other are not added again.
+                change = each(jnp.subtract, of_rows(_derivative, there), derivative)
+                rates = each(jnp.multiply, change, slope)
+            else:
+                rates = of_rows(_rate, there, slope)
             first = linear + step * quadratic + system.total(rates)
             low = jnp.where(first < 0.0, step, low)
             high = jnp.where(first < 0.0, high, step)
@@ -384,6 +389,11 @@ def minimize(system: System, iterations: int, line_search: int) -> tuple[Any, An
             following = jnp.where(inside, following, 0.5 * (low + high))
             now = of_rows(_piece, there)
             goes_on = system.differ(before, now)
+            if thorough and not has_cones:
+                # Within a piece it is at the minimum already, but for rounding.
+                exact = is_newton & ~goes_on
+                following = jnp.where(exact, step, following)
+                inside |= exact
             if has_cones:
                 change = following - step
                 goes_on |= moves(jnp.abs(change) > 0.01 * step, change)

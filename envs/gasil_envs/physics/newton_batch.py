@@ -191,7 +191,7 @@ class _Batch:
         parts = jax.tree.leaves(
             jax.tree.map(lambda x, y: fold(jnp.logical_or, _flat(x != y)), a, b)
         )
-        return jnp.any(functools.reduce(jnp.logical_or, parts))
+        return functools.reduce(jnp.logical_or, parts)
 
     def store(self, tree: Any) -> Any:
         return materialize(tree)
@@ -217,7 +217,7 @@ class _Batch:
         def body(state: Any) -> Any:
             count, _, carry = state
             carry, changed = function(carry)
-            return count + 1, changed, carry
+            return count + 1, jnp.any(changed), carry
 
         return jax.lax.while_loop(goes_on, body, (0, True, carry))[2]
 
