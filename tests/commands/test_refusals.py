@@ -127,6 +127,8 @@ evaluate RUN/nowhere | does not exist: it must be the folder of a run or a sweep
 swept --point 4 | has points 0 to 1
 swept --point 1 --checkpoint best | it must be 'last'
 draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
+draw --smooth 0 | smooth is 0: it must be 1 or more
+draw --x steps | x is 'steps': it must be one of env_steps
 draw --out x.txt | must end in .png, .pdf, .svg
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png
