@@ -51,6 +51,7 @@ hopper --alpha big | alpha is 'big': it must be a number
 hopper --minibatch-size 60 | nearest that does is 64
 hopper --reward-delay 0 | reward_delay is 0
 hopper --out /proc/nowhere/run | can't be written
+hopper --lr 1 | option --lr is unknown: did you mean --learning-rate?
 hopper --total-step 5 | is unknown: did you mean --total-steps?
 hopper --xyz 5 | option --xyz is unknown: see --help
 hopper --normalize-rewards False | 'False' is not an option or its
