@@ -169,13 +169,9 @@ def _untrained(out, env, **settings):
     from gasil_jax.host.environments import Settings
     from gasil_jax.host.sweep import Sweep
 
-    algorithm = gasil_jax.algorithm(
-        num_envs=1,
-        batch_steps=64,
-        hidden_sizes=(8,),
-        discriminator_hidden_sizes=(8,),
-        buffer_steps=200,
-    )
+    layers = {"hidden_sizes": (8,), "discriminator_hidden_sizes": (8,)}
+    sizes = {"num_envs": 1, "batch_steps": 64, "buffer_steps": 200}
+    algorithm = gasil_jax.algorithm(**sizes, **layers)
     sweep = Sweep(env, algorithm, (0,), settings=Settings(**settings))
     out.mkdir()
     sweep.write(out)

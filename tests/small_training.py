@@ -9,14 +9,8 @@ import numpy as np
 import gasil_jax
 
 #: Settings that every agent has.
-SETTINGS = {
-    "total_steps": 256,
-    "num_envs": 4,
-    "batch_steps": 128,
-    "minibatch_size": 32,
-    "num_epochs": 1,
-    "hidden_sizes": (8,),
-}
+SETTINGS = {"total_steps": 256, "num_envs": 4, "batch_steps": 128, "num_epochs": 1}
+SETTINGS |= {"minibatch_size": 32, "hidden_sizes": (8,)}
 #: The same as flags. A flag that follows replaces an earlier one, but for the widths of
 #: layers.
 FLAGS = (

@@ -97,14 +97,9 @@ def test_the_wheel_alone_trains(tmp_path):
         # Another test may be writing an entry of the cache that they share.
         "PYTHONWARNINGS": "ignore:Error reading persistent compilation cache",
     }
-    result = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=tmp_path,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=200,
-    )
+    command = [sys.executable, "-c", program]
+    place = {"cwd": tmp_path, "env": environment, "timeout": 200}
+    result = subprocess.run(command, capture_output=True, text=True, **place)
     assert result.returncode == 0, result.stderr
     # Nothing that is imported prints.
     line, following = result.stdout.splitlines()

@@ -34,15 +34,9 @@ TRAINING = {
 }
 SMALL = ("--total-steps", "512", *FLAGS[4:])
 #: What stands for an option's value when a command is run.
-TOY = {
-    "--env": "point_mass",
-    # Others may have nothing for it.
-    "--preset": "tuned",
-    "--reward-delay": "1",
-    "--seeds": "2",
-    "--episodes": "2",
-    "--evaluate-every": "128",
-}
+TOY = {"--env": "point_mass", "--reward-delay": "1", "--seeds": "2", "--episodes": "2"}
+# Other presets may have nothing for it.
+TOY |= {"--preset": "tuned", "--evaluate-every": "128"}
 #: In a command that needs a run of a locomotion task.
 LOCOMOTION = "--gymnasium"
 #: How commands begin that are not run here, and why.
@@ -412,13 +406,8 @@ def rows_of(page, heading):
 @pytest.mark.parametrize("agent", gasil_jax.agents.AGENTS)
 def test_the_list_of_metrics_is_complete(agent, tmp_path):
     env = gasil_jax.make_env("point_mass", reward_delay=5)
-    algorithm = gasil_jax.algorithm(
-        agent,
-        batch_steps=64,
-        num_envs=4,
-        normalize_rewards=True,
-        decompose_rewards=True,
-    )
+    models = {"normalize_rewards": True, "decompose_rewards": True}
+    algorithm = gasil_jax.algorithm(agent, batch_steps=64, num_envs=4, **models)
     if agent == "gail":
         observation = np.zeros((9, env.observation_size), np.float32)
         action = np.zeros((9, env.action_size), np.float32)

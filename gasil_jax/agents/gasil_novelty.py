@@ -161,6 +161,7 @@ class PPOGASILNovelty(PPONovelty, PPOGASIL):
     def remember(self, state: Any, context: Context) -> Any:
         batch, visits = context.rollout, self.count(state.visits, context)
         novelty, total = self.follow_novelty(state.novelty, visits, context)
+        assert context.history is not None  # Ensured by `history_episodes`.
         # The history is as long as the longest episode, or a little longer.
         tie = TIE * context.reward_scale * total / context.history.ended.shape[1]
         rank = batch.discounted_return + tie

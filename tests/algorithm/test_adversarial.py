@@ -81,12 +81,8 @@ def test_a_rule_is_the_product_of_the_factors_in_its_name(rule, sign):
 def twin(name, logit):
     """The bonus from D itself, in double precision."""
     d = 1 / (1 + np.exp(-logit))
-    ratio = np.log(1 - d) - np.log(d)
-    return {
-        "softplus": -np.log(d),
-        "logit": ratio,
-        "centered": -np.log(d) - np.mean(-np.log(d)),
-    }[name]
+    forms = {"softplus": -np.log(d), "logit": np.log(1 - d) - np.log(d)}
+    return (forms | {"centered": -np.log(d) - np.mean(-np.log(d))})[name]
 
 
 @pytest.mark.parametrize("name", adversarial.BONUSES)

@@ -22,11 +22,8 @@ ENV = gasil_jax.make_env("point_mass")
 CONFIG = gasil_jax.Config(
     total_steps=40 * 2048, num_epochs=5, hidden_sizes=(64,), learning_rate=6e-4
 )
-DISCRIMINATOR = {
-    "discriminator_hidden_sizes": (64,),
-    "discriminator_updates": 20,
-    "discriminator_learning_rate": 3e-4,
-}
+DISCRIMINATOR = {"discriminator_updates": 20, "discriminator_learning_rate": 3e-4}
+DISCRIMINATOR |= {"discriminator_hidden_sizes": (64,)}
 # GAIL needs an expert: test_discrete.py.
 SELF_TAUGHT = (
     gasil_jax.PPO(),

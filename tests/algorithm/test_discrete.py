@@ -23,22 +23,11 @@ from gasil_jax import (
 from gasil_jax.host import saved
 from gasil_jax.networks import Discriminator
 
-SETTINGS = {
-    "total_steps": 20 * 256,
-    "num_envs": 8,
-    "batch_steps": 256,
-    "minibatch_size": 64,
-    "num_epochs": 4,
-    "hidden_sizes": (16,),
-    "learning_rate": 1e-2,
-    "gamma": 0.9,
-    "entropy_coefficient": 0.01,
-}
-DISCRIMINATOR = {
-    "discriminator_hidden_sizes": (16,),
-    "discriminator_learning_rate": 1e-2,
-    "discriminator_updates": 20,
-}
+SETTINGS = {"total_steps": 20 * 256, "num_envs": 8, "batch_steps": 256, "gamma": 0.9}
+SETTINGS |= {"minibatch_size": 64, "num_epochs": 4, "hidden_sizes": (16,)}
+SETTINGS |= {"learning_rate": 1e-2, "entropy_coefficient": 0.01}
+DISCRIMINATOR = {"discriminator_updates": 20, "discriminator_learning_rate": 1e-2}
+DISCRIMINATOR |= {"discriminator_hidden_sizes": (16,)}
 
 
 @pytest.fixture(scope="module")

@@ -35,18 +35,10 @@ def test_many_batched_orthogonal_matrices_do_not_deadlock():
         assert float(jnp.max(jnp.abs(product - jnp.eye(64)[None]))) < 1e-4
 
 
-ALGORITHM = gasil_jax.algorithm(
-    num_envs=2,
-    batch_steps=4,
-    total_steps=8,
-    minibatch_size=2,
-    num_epochs=1,
-    hidden_sizes=(4,),
-    discriminator_hidden_sizes=(4,),
-    discriminator_minibatch_size=8,
-    discriminator_updates=1,
-    buffer_steps=3,
-)
+SETTINGS = {"num_envs": 2, "batch_steps": 4, "total_steps": 8, "minibatch_size": 2}
+SETTINGS |= {"hidden_sizes": (4,), "discriminator_hidden_sizes": (4,), "num_epochs": 1}
+SETTINGS |= {"discriminator_minibatch_size": 8, "discriminator_updates": 1}
+ALGORITHM = gasil_jax.algorithm(**SETTINGS, buffer_steps=3)
 
 
 @pytest.mark.compiled_as_for_users

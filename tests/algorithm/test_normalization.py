@@ -56,12 +56,8 @@ def test_batches_of_rewards_give_the_scale_of_all_steps():
     ended = rng.random((60, 3)) < 0.1
     normalizer = rewards.init(3)
     for begin, end in ((0, 7), (7, 8), (8, 60)):
-        normalizer = update(
-            normalizer,
-            jnp.asarray(reward[begin:end], jnp.float32),
-            jnp.asarray(ended[begin:end]),
-            gamma=0.9,
-        )
+        batch = jnp.float32(reward[begin:end]), jnp.asarray(ended[begin:end])
+        normalizer = update(normalizer, *batch, gamma=0.9)
         expected = plain_scale(reward[:end], ended[:end], 0.9)
         np.testing.assert_allclose(rewards.scale(normalizer), expected, rtol=1e-4)
     paid = jnp.array([30.0, -1e9])

@@ -38,11 +38,8 @@ def test_scaled_rows_follow_the_number_of_actions(env):
     assets = pathlib.Path(gymnasium.__file__).parent / "envs/mujoco/assets"
     actions = mujoco.MjModel.from_xml_path(str(assets / locomotion.TASKS[env].xml)).nu
     # Straight lines from two dimensions to eight; more have the values of eight.
-    ends = {
-        "learning_rate": (7.5e-4, 1e-4),
-        "initial_std": (0.7, 0.25),
-        "gae_lambda": (0.975, 0.9),
-    }
+    ends = {"learning_rate": (7.5e-4, 1e-4), "initial_std": (0.7, 0.25)}
+    ends |= {"gae_lambda": (0.975, 0.9)}
     for delay in (1, 20):
         row = gasil_jax.preset(env, "ppo", "scaled", reward_delay=delay)
         for name, values in ends.items():

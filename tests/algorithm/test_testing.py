@@ -24,14 +24,10 @@ def test_an_example_is_what_the_first_iteration_gives():
     """Arrays by their kinds, and the batch by its numbers, which an agent has kept."""
     env, key = gasil_jax.make_env("point_mass", reward_delay=5), jax.random.key(3)
     agent = Keeps()
-    algorithm = gasil_jax.Algorithm(agent).replace(
-        batch_steps=256,
-        num_envs=2,
-        num_epochs=1,
-        hidden_sizes=(4,),
-        normalize_rewards=True,
-        learning_rate_schedule=((0.0, 0.5), (1.0, 1.0)),
-    )
+    small = {"batch_steps": 256, "num_envs": 2, "num_epochs": 1, "hidden_sizes": (4,)}
+    more = {"learning_rate_schedule": ((0.0, 0.5), (1.0, 1.0))}
+    algorithm = gasil_jax.Algorithm(agent).replace(**small, **more)
+    algorithm = algorithm.replace(normalize_rewards=True)
     example = lambda key, used=algorithm: example_context(env, used, key)
 
     def first(key, used=algorithm):

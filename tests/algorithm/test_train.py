@@ -11,19 +11,10 @@ import gasil_jax
 from gasil_envs.gymnax_adapter import GymnaxEnv
 from gasil_jax import learner
 
-CONFIG = gasil_jax.Config(
-    total_steps=512,
-    num_envs=4,
-    batch_steps=256,
-    minibatch_size=64,
-    num_epochs=2,
-    hidden_sizes=(16,),
-)
-IMITATION = {
-    "discriminator_hidden_sizes": (16,),
-    "discriminator_updates": 2,
-    "buffer_steps": 100,
-}
+CONFIG = gasil_jax.Config(num_envs=4, num_epochs=2, hidden_sizes=(16,))
+CONFIG = CONFIG.replace(total_steps=512, batch_steps=256, minibatch_size=64)
+IMITATION = {"discriminator_updates": 2, "buffer_steps": 100}
+IMITATION |= {"discriminator_hidden_sizes": (16,)}
 AGENTS = (
     gasil_jax.PPO(),
     gasil_jax.PPOBC(buffer_steps=100),

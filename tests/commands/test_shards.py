@@ -85,16 +85,10 @@ SMALL = (
 
 def trained_for(seconds, num_members):
     """What is stored of how a program was trained, for so many seconds a member."""
-    return Training(
-        iterations=3,
-        env_steps=300 * num_members,
-        compile_seconds=1.0,
-        train_seconds=seconds * num_members,
-        evaluation_seconds=None,
-        device="1 x cpu",
-        device_count=1,
-        versions={},
-    )
+    trained = {"iterations": 3, "env_steps": 300 * num_members, "versions": {}}
+    took = {"compile_seconds": 1.0, "train_seconds": seconds * num_members}
+    on = {"device": "1 x cpu", "device_count": 1}
+    return Training(**trained, **took, **on, evaluation_seconds=None)
 
 
 def train(folder, shard=None, *arguments, grid=GRID):
@@ -122,15 +116,11 @@ def write_metrics(program):
     value = [200.0 * x.alpha + 20 * x.discriminator_updates for x in agents]
     value = (np.array(value) + program.seeds)[:, None] + steps
     zero = np.zeros_like(value)
-    writer.write(
-        {
-            "env_steps": zero + steps,
-            "episode_return": np.where(value % 100 == 61, np.nan, value),
-            "episode_length": zero + 7.0,
-            "skipped_updates": np.where(value == 342.0, 1.0, 0.0),
-            "faulty_steps": zero,
-        }
-    )
+    returns = np.where(value % 100 == 61, np.nan, value)
+    metrics = {"env_steps": zero + steps, "episode_return": returns}
+    skipped = np.where(value == 342.0, 1.0, 0.0)
+    metrics |= {"episode_length": zero + 7.0, "skipped_updates": skipped}
+    writer.write(metrics | {"faulty_steps": zero})
     writer.close()
 
 

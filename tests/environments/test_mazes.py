@@ -20,12 +20,8 @@ def is_robot(name):
 def test_reset_and_step(name):
     env = gasil_envs.make(f"sparse:{name}")
     user_environment.check(name, env.env, env)
-    check_reset_and_step(
-        env,
-        jax.jit(jax.vmap(env.reset)),
-        jax.jit(jax.vmap(env.step)),
-        same_start=wrappers.is_discrete(env),
-    )
+    reset, step = jax.jit(jax.vmap(env.reset)), jax.jit(jax.vmap(env.step))
+    check_reset_and_step(env, reset, step, same_start=wrappers.is_discrete(env))
     state = env.reset(jax.random.key(0)).pipeline_state
     picture = pictures.painter(env, (60, 40)).draw([jax.tree.map(np.asarray, state)])
     assert picture.shape == (40, 60, 3) and picture.min() < 20 < picture.max()

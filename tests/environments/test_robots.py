@@ -181,13 +181,8 @@ KEYS = """<keyframe><key name="up" qpos="0.5" qvel="2"/><key qpos="1"/></keyfram
 
 def test_an_episode_starts_from_a_keyframe():
     for keyframe, expected in ((None, [0, 0]), ("up", [0.5, 2]), (1, [1, 0])):
-        task = Task(
-            xml=arm(top=KEYS),
-            frame_skip=1,
-            hidden_positions=0,
-            reset_noise=0.0,
-            keyframe=keyframe,
-        )
+        still = {"hidden_positions": 0, "reset_noise": 0.0}
+        task = Task(xml=arm(top=KEYS), frame_skip=1, keyframe=keyframe, **still)
         start = Locomotion(task).reset(jax.random.key(0))
         np.testing.assert_allclose(start.obs, expected)
     with pytest.raises(ValueError, match="keyframe is 'down': it must be one of up, "):

@@ -101,12 +101,9 @@ def alone(effect):
 
 
 def test_the_probability_of_improvement_is_of_pairs_of_seeds():
-    data = {
-        ("a", "x"): np.array([3.0, 1.0]),
-        ("a", "y"): np.array([2.0, 1.0]),
-        ("b", "x"): np.array([9.0, 9.0]),
-        ("b", "y"): np.array([-1.0, 8.0]),
-    }
+    data = {("a", "x"): [3.0, 1.0], ("a", "y"): [2.0, 1.0]}
+    data |= {("b", "x"): [9.0, 9.0], ("b", "y"): [-1.0, 8.0]}
+    data = {key: np.array(scores) for key, scores in data.items()}
     improvement = lambda *of: comparisons.improvement("", sides(data, *of)).middle + 0.5
     # 2 of 4 pairs and half of another on one task, and all 4 on the other.
     assert improvement("ab", ("x", "y")) == 0.8125

@@ -105,13 +105,8 @@ def test_an_agent_with_ppos_values_keeps_what_ppo_does_not_have(tmp_path):
 
 
 def test_the_papers_protocol_has_the_appendix_s_values():
-    for agent, count in {
-        "ppo": 4,
-        "ppo+bc": 16,
-        "ppo+sil": 16,
-        "ppo+bonus": 16,
-        "ppo+gasil": 32,
-    }.items():
+    numbers = {"ppo": 4, "ppo+bc": 16, "ppo+sil": 16, "ppo+bonus": 16, "ppo+gasil": 32}
+    for agent, count in numbers.items():
         points = search.paper_points(agent)
         assert len(points) == len(set(map(str, points))) == count
         for name, values in search.PAPER_SPACES[agent].items():

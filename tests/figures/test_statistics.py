@@ -30,12 +30,9 @@ def test_the_interval_is_scipys():
     scores = np.random.default_rng(0).gamma(2.0, size=(30, 2))
     low, high = statistics.bootstrap_interval(scores, resamples=4000)
     for i in range(2):
+        given = {"n_resamples": 4000, "rng": np.random.default_rng(1)}
         expected = scipy.stats.bootstrap(
-            (scores[:, i],),
-            statistics.interquartile_mean,
-            n_resamples=4000,
-            method="percentile",
-            rng=np.random.default_rng(1),
+            (scores[:, i],), statistics.interquartile_mean, method="percentile", **given
         ).confidence_interval
         np.testing.assert_allclose([low[i], high[i]], expected, atol=0.05)
 

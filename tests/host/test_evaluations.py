@@ -87,13 +87,9 @@ def test_training_is_the_same_without_evaluation(evaluated, tmp_path, capsys):
 def test_the_scores_are_those_of_evaluate(evaluated):
     env, algorithm, seeds, states = saved.load(evaluated)
     for index, (seed, row) in enumerate(zip(seeds, rows(evaluated)[-3:], strict=True)):
-        scores = evaluate_directly(
-            env,
-            algorithm,
-            gasil_jax.member(states, index),
-            key=evaluation_key(seed, ITERATIONS),
-            num_episodes=EPISODES,
-        )
+        of_seed = env, algorithm, gasil_jax.member(states, index)
+        key = evaluation_key(seed, ITERATIONS)
+        scores = evaluate_directly(*of_seed, key=key, num_episodes=EPISODES)
         returns = np.asarray(scores["episode_return"])
         direct = [returns.mean(), returns.min(), returns.max()]
         written = [float(row[name]) for name in ("mean", "min", "max")]

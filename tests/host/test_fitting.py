@@ -159,15 +159,9 @@ def test_more_seeds_and_points_are_trained_and_no_others(env, tmp_path):
 
     def fit(total_steps=256, **arguments):
         algorithm, calls = SHORT.replace(total_steps=total_steps), []
-        result = gasil_jax.fit(
-            env,
-            algorithm,
-            folder=folder,
-            resume=True,
-            callback=lambda x: calls.append(x.metrics["policy_loss"].shape),
-            **arguments,
-        )
-        return result, calls
+        callback = lambda x: calls.append(x.metrics["policy_loss"].shape)
+        given = {"folder": folder, "resume": True, "callback": callback}
+        return gasil_jax.fit(env, algorithm, **given, **arguments), calls
 
     rates = [{"learning_rate": x} for x in (1e-3, 1e-2)]
     first, calls = fit(seeds=[4, 2], points=rates[:1])

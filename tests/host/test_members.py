@@ -22,13 +22,9 @@ def compiled():
     """
     env = gasil_jax.make_env("point_mass", reward_delay=7, obs_noise=0.1)
     # An episode that is cut short has no return.
-    algorithm = gasil_jax.algorithm(
-        "ppo+gasil",
-        **SETTINGS | DISCRIMINATOR | {"total_steps": 4 * 128},
-        buffer_steps=100,
-        stagger_episodes=False,
-        normalize_rewards=True,
-    )
+    settings = SETTINGS | DISCRIMINATOR | {"total_steps": 4 * 128, "buffer_steps": 100}
+    settings |= {"stagger_episodes": False, "decompose_rewards": True}
+    algorithm = gasil_jax.algorithm("ppo+gasil", **settings)
     members = make_members(env, algorithm, [3, 4, 5], devices=jax.devices()[:2])
     states, advance = members.compile()
     return members, jax.tree.map(jnp.asarray, members.trim(states)), advance

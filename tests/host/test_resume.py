@@ -44,13 +44,9 @@ def start(out, *arguments, cache):
     mine = os.environ | {"XDG_CACHE_HOME": str(cache)}
     for of_tests in ("JAX_COMPILATION_CACHE_DIR", "TF_CPP_MIN_LOG_LEVEL"):
         del mine[of_tests]
-    return subprocess.Popen(
-        [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments],
-        env=mine,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    command = [sys.executable, "-m", "gasil_jax.run", "--out", str(out), *arguments]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, env=mine, text=True, **pipes)
 
 
 def wait_for(condition, *children, seconds=120):
