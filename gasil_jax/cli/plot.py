@@ -132,6 +132,8 @@ def read_csv(path: pathlib.Path, label: str | None, columns: Sequence[str]) -> C
         # All seeds at the steps of the one with the fewest rows, as far as all reach.
         steps = min((own for own, _ in seeds), key=len)
         steps = steps[steps <= min(own[-1] for own, _ in seeds)]
+        if not steps.size:
+            raise ValueError(f"no {columns[0]} is in all its files")
         values = np.array([np.interp(steps, own, y) for own, y in seeds])
         env_steps, means = plotting.binned_returns(steps, values)
     except (OSError, ValueError, csv.Error) as error:

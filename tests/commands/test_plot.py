@@ -123,6 +123,9 @@ def test_files_of_other_libraries_are_curves(trained, figures, tmp_path, capsys)
             path.write_text(f"global_step,charts/episodic_return\n{rows}\n")
         told = refused(capsys, plot, path, *columns, "--out", tmp_path / "y.png")
         assert f"{path} can't be drawn: " in told and message in told
+    (monitors / "1.csv").write_text("r,l\n1,900\n")
+    told = refused(capsys, plot, monitors, "--columns", "sum:l", "r")
+    assert f"{monitors} can't be drawn: no sum:l is in all its files" in told
     assert "columns has 0 names: " in refused(capsys, plot, clean)
     told = refused(capsys, plot, clean, "--columns", "global_step", "return")
     assert "column 'return' is unknown: did you mean" in told
