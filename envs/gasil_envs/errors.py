@@ -35,14 +35,16 @@ def nearest(name: str, allowed: Iterable[str]) -> str | None:
     """Return the allowed name that is most similar to `name`, or None if none is.
 
     Capital letters and small ones count as the same. A prefix, as in "gymnax:Catch",
-    does not make names similar. A name that is a part of another is near it:
-    Gymnasium writes "Hopper-v5".
+    does not make names similar. A name that is a part of another is near it, as "lr" is
+    to "learning_rate".
     """
     bare = {x.rpartition(":")[2].lower(): x for x in allowed}
     given = name[:300].rpartition(":")[2].lower()
     close = difflib.get_close_matches(given, bare, n=1, cutoff=0.7)
-    if not close and len(given) > 2:
-        close = [x for x in bare if given in x]
+    if not close:
+        initials = {x: "".join(word[:1] for word in x.split("_")) for x in bare}
+        longer = len(given) > 2
+        close = [x for x in bare if given == initials[x] or (longer and given in x)]
     return bare[close[0]] if close else None
 
 

@@ -1,9 +1,10 @@
 """Plot one or several runs: ``python -m gasil_jax.plot RUN [RUN ...]``."""
 
+import csv
 import dataclasses
 import pathlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -11,8 +12,8 @@ from gasil_jax import statistics
 from gasil_jax.cli.parsing import POSITIONAL
 from gasil_jax.cli.parsing import read as read_options
 from gasil_jax.cli.reporting import reports_errors
-from gasil_jax.errors import InputError, unknown
-from gasil_jax.host import output_file, plotting, results, saved, tables
+from gasil_jax.errors import InputError, refusal, unknown
+from gasil_jax.host import folders, output_file, plotting, results, saved, tables
 from gasil_jax.host.plotting import COLORS
 from gasil_jax.host.programs import Program
 
@@ -25,13 +26,20 @@ class Options:
 
     Attributes:
       runs: folders of runs and sweeps, each a curve of its own, and a sweep over agents
-        one for each agent.
+        one for each agent; and CSV files of other libraries, or folders of them with
+        one for each seed (see columns).
       point: number of a sweep's point in results.csv; default the one with the
         highest mean final return, of those whose seeds all stayed finite.
       out: image file to write: PNG, PDF or SVG.
       labels: labels of the runs; default "ENVIRONMENT, AGENT", and the folder of those
         that would look alike.
       metric: column of metrics.csv to draw.
+      x: what is on the x axis.
+      smooth: number of the 50 parts of training whose moving mean is drawn.
+      columns: of CSV files the columns of x and of the return; "sum:" before a name
+        adds its numbers up. For Stable-Baselines3 "time/total_timesteps
+        rollout/ep_rew_mean" (progress.csv) or "sum:l r" (monitor.csv), for CleanRL
+        "global_step charts/episodic_return".
     """
 
     runs: tuple[pathlib.Path, ...] = dataclasses.field(metadata=POSITIONAL)
@@ -39,14 +47,17 @@ class Options:
     out: pathlib.Path = pathlib.Path("curves.png")
     labels: tuple[str, ...] = ()
     metric: str = "episode_return"
+    x: Literal["env_steps", "iteration", "episodes"] = "env_steps"
+    smooth: int = 1
+    columns: tuple[str, ...] = ()
 
 
 class Curves(NamedTuple):
     """The curves of one run."""
 
-    env: str  # the environment's name
+    env: str  # the environment's name; empty if a file does not say it
     label: str  # label in the legend
-    env_steps: np.ndarray  # (points,)
+    env_steps: np.ndarray  # (points,), or what else is on the x axis
     # (seeds, points), mean return of the episodes since the previous point.
     returns: np.ndarray
     final: np.ndarray  # (seeds,), mean return over the last tenth of training
@@ -61,19 +72,25 @@ def read(
     point: int | None = None,
     *,
     metric: str = "episode_return",
+    x: str = "env_steps",
 ) -> Curves:
     """Return the curves of a run, or of a sweep's point, which need not be finished."""
     env, agent, programs = saved.find(folder, point)
-    metrics = _read_tables(programs, "metrics.csv", metric)
+    metrics = _read_tables(programs, "metrics.csv", metric, "episodes")
     if not metrics:
         raise InputError(f"{folder} has no curves to draw yet")
     values = metrics[metric]
-    env_steps, means = plotting.binned_returns(metrics["env_steps"][0], values)
+    places = {
+        "env_steps": metrics["env_steps"][0],
+        "iteration": np.arange(1, values.shape[1] + 1),
+        "episodes": np.nancumsum(metrics["episodes"], axis=1).mean(axis=0),
+    }
+    env_steps, means = plotting.binned_returns(places[x], values)
     if not len(env_steps):
         raise InputError(f"{folder}: not every seed has ended an episode")
-    # Evaluations know the return alone.
+    # Evaluations know the steps and the return alone.
     evaluations: Mapping[str, np.ndarray] = {}
-    if metric == "episode_return":
+    if (metric, x) == ("episode_return", "env_steps"):
         evaluations = _read_tables(programs, "evaluations.csv", "mean")
     return Curves(
         env=env,
@@ -86,9 +103,9 @@ def read(
 
 
 def _read_tables(
-    programs: Sequence[Program], name: str, column: str
+    programs: Sequence[Program], name: str, column: str, *others: str
 ) -> dict[str, np.ndarray]:
-    """Return steps and a column for all members, up to the last row that all have."""
+    """Return steps and columns for all members, up to the last row that all have."""
     required = (column,) if column in (*tables.COLUMNS, "mean") else ()
     every = [own for each in programs for own in each.table(name, required)]
     if not all(every):
@@ -98,12 +115,60 @@ def _read_tables(
     length = min(len(columns["env_steps"]) for columns in every)
     return {
         x: np.stack([columns[x][:length] for columns in every])
-        for x in ("env_steps", column)
+        for x in ("env_steps", column, *others)
     }
 
 
+def read_csv(path: pathlib.Path, label: str | None, columns: Sequence[str]) -> Curves:
+    """Return the curves of another library's CSV file, or of a folder of them."""
+    if len(columns) != 2:
+        raise InputError(
+            f"columns has {len(columns)} names: {path} needs two, of x and the return"
+        )
+    try:
+        seeds = [
+            _read_numbers(x, columns) for x in sorted(path.glob("*.csv")) or [path]
+        ]
+        # All seeds at the steps of the one with the fewest rows, as far as all reach.
+        steps = min((own for own, _ in seeds), key=len)
+        steps = steps[steps <= min(own[-1] for own, _ in seeds)]
+        if not steps.size:
+            raise ValueError(f"no {columns[0]} is in all its files")
+        values = np.array([np.interp(steps, own, y) for own, y in seeds])
+        env_steps, means = plotting.binned_returns(steps, values)
+    except (OSError, ValueError, csv.Error) as error:
+        raise InputError(f"{path} can't be drawn: {error}") from None
+    final = tables.final_returns(values)
+    return Curves("", label or path.stem, env_steps, means, final, None)
+
+
+def _read_numbers(path: pathlib.Path, columns: Sequence[str]) -> list[np.ndarray]:
+    """Return two columns of a CSV file, without rows that lack a number of either."""
+    # Stable-Baselines3's monitor begins with a comment.
+    lines = [x for x in path.read_text().splitlines() if not x.startswith("#")]
+    table = csv.DictReader(lines)
+    names = [x.removeprefix("sum:") for x in columns]
+    for name in names:
+        if name not in (there := table.fieldnames or ()):
+            raise ValueError(unknown("column", name, there))
+    numbers = [[float(row[x] or "nan") for x in names] for row in table]
+    rows = np.array(numbers).reshape(-1, len(names))
+    rows = rows[np.isfinite(rows).all(axis=1)]
+    both = [
+        np.cumsum(own) if name.startswith("sum:") else own
+        for name, own in zip(columns, rows.T, strict=True)
+    ]
+    if not rows.size or (np.diff(both[0]) < 0.0).any():
+        raise ValueError(f"{columns[0]} must have numbers that do not fall")
+    return both
+
+
 def draw(
-    runs: Sequence[Curves], path: pathlib.Path, metric: str = "episode_return"
+    runs: Sequence[Curves],
+    path: pathlib.Path,
+    *,
+    metric: str = "episode_return",
+    x: str = "env_steps",
 ) -> None:
     """Draw each environment's returns, final returns and performance profiles."""
     from matplotlib.figure import Figure
@@ -113,7 +178,7 @@ def draw(
     grid = figure.subplots(len(envs), 3, width_ratios=(3, 2, 2), squeeze=False)
     for row, env in zip(grid, envs, strict=True):
         own = [run for run in runs if run.env == env]
-        _draw_row(row, own)
+        _draw_row(row, own, x)
         words = metric.replace("_", " ")
         row[0].set_ylabel(words)
         for axes in row[1:]:
@@ -125,7 +190,7 @@ def draw(
     figure.savefig(path, dpi=150)
 
 
-def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
+def _draw_row(row: Any, runs: Sequence[Curves], x: str) -> None:
     """Draw the runs of one environment in its three panels."""
     curves, bars, profile = row
     every = np.concatenate([run.final for run in runs])
@@ -136,7 +201,9 @@ def _draw_row(row: Any, runs: Sequence[Curves]) -> None:
     labels = [f" {label}" if label.startswith("_") else label for label in labels]
     margin = 0.05 * (np.ptp(every) or 1.0)
     levels = np.linspace(every.min() - margin, every.max() + margin, 200)
-    unit, words = plotting.unit_of_steps(max(run.env_steps[-1] for run in runs))
+    unit, words = 1.0, x
+    if x == "env_steps":
+        unit, words = plotting.unit_of_steps(max(run.env_steps[-1] for run in runs))
     curves.set_xlabel(words)
     for number, run in enumerate(runs):
         color = COLORS[number % len(COLORS)]
@@ -187,25 +254,37 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"labels has {len(labels)} names: it must have one for each of the "
             f"{len(options.runs)} runs"
         )
+    if options.smooth < 1:
+        raise refusal("smooth", options.smooth, "1 or more")
     output_file.check(options.out, (".png", ".pdf", ".svg"))
+    drawn = {"metric": options.metric, "x": options.x}
     runs, places = [], []
     for folder, label in zip(options.runs, labels, strict=True):
+        foreign = options.columns and not folders.has_config(folder)
+        if foreign or folder.suffix == ".csv":
+            runs.append(read_csv(folder, label, options.columns))
+            places.append(folder)
+            continue
         best = {} if options.point is not None else results.best_points(folder)[1]
         several = {x: y for x, y in best.items() if y is not None and len(best) > 1}
         for agent, point in several.items() or [("", options.point)]:
             own = f"{label}, {agent}" if label and agent else label
-            runs.append(read(folder, own, point, metric=options.metric))
+            runs.append(read(folder, own, point, **drawn))
             places.append(folder)
     told = [run.label for run in runs]
+    # A file does not say its environment: it stands beside the first run.
+    env = next((run.env for run in runs if run.env), "")
     runs = [
-        run._replace(label=f"{run.label} ({folder})")
-        if told.count(run.label) > 1
-        else run
+        run._replace(
+            env=run.env or env,
+            label=f"{run.label} ({folder})" if told.count(run.label) > 1 else run.label,
+            returns=plotting.smoothed(run.returns, options.smooth),
+        )
         for folder, run in zip(places, runs, strict=True)
     ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:
-        draw(runs, partial, options.metric)
+        draw(runs, partial, **drawn)
     print("run                             seeds  interquartile mean [95% interval]")
     for run in runs:
         estimate = statistics.estimate(run.final)

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from typing import ParamSpec
 
 from gasil_envs.user_code import in_a_line
+from gasil_jax import cli
 from gasil_jax.errors import InputError
 from gasil_jax.host.interruption import Interrupted
 
@@ -30,6 +31,8 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
 
     @functools.wraps(main)
     def reporting(*args: P.args, **kwargs: P.kwargs) -> int:
+        if signal.getsignal(signal.SIGINT) is cli.quit_at_once:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         try:
             return main(*args, **kwargs)
         except BrokenPipeError:
@@ -52,8 +55,7 @@ def reports_errors(main: Callable[P, int]) -> Callable[P, int]:
         # Ctrl-C outside of training, or for the second time during it.
         except KeyboardInterrupt:
             print("interrupted", file=sys.stderr, flush=True)
-            spec = getattr(sys.modules["__main__"], "__spec__", None)
-            if spec is not None and spec.name.startswith("gasil_jax."):
+            if cli.IS_PROGRAM:
                 # Python's own end would wait for threads, of which one may compile.
                 with contextlib.suppress(OSError):
                     sys.stdout.flush()

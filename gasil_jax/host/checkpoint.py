@@ -13,13 +13,16 @@ training continues from an older one.
 """
 
 import contextlib
+import functools
 import hashlib
 import json
+import logging
 import math
 import os
 import pathlib
 import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
 from typing import Any, NamedTuple, TypedDict
@@ -52,6 +55,23 @@ def _as_arrays(state: Any) -> dict[str, Any]:
     }
 
 
+@functools.cache
+def _quiet_orbax() -> Any:
+    """Import Orbax, whose threads no longer print an error that it also raises."""
+    # Commands that read no checkpoint, such as --help, start sooner without it.
+    import orbax.checkpoint as ocp
+
+    def is_news(record: logging.LogRecord) -> bool:
+        return "os_error_code" not in f"{record.getMessage()} {record.exc_info}"
+
+    for name in ("absl", "asyncio"):
+        logging.getLogger(name).addFilter(is_news)
+    # TensorStore reports each array to Orbax's loop, which ends with the first.
+    late, before = "Event loop is closed", sys.unraisablehook
+    sys.unraisablehook = lambda x: late in str(x.exc_value) or before(x)
+    return ocp
+
+
 @contextlib.contextmanager
 def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     """Yield Orbax's checkpointer, and another path to a folder that it understands.
@@ -59,9 +79,7 @@ def _orbax(folder: pathlib.Path) -> Iterator[tuple[Any, pathlib.Path]]:
     Orbax takes a path with brackets or stars for a pattern, so no character of the
     other path means anything.
     """
-    # Commands that read no checkpoint, such as --help, start sooner without it.
-    import orbax.checkpoint as ocp
-
+    ocp = _quiet_orbax()
     try:
         with tempfile.TemporaryDirectory() as directory:
             link = pathlib.Path(directory, "checkpoints")

@@ -47,6 +47,15 @@ def binned_returns(
     return steps, np.stack(means, axis=1)
 
 
+def smoothed(returns: np.ndarray, window: int) -> np.ndarray:
+    """Return the means over each point and those before it, `window` in all."""
+    means = [
+        returns[..., max(0, end - window) : end].mean(axis=-1)
+        for end in range(1, returns.shape[-1] + 1)
+    ]
+    return np.stack(means, axis=-1)
+
+
 def unit_of_steps(most: float) -> tuple[float, str]:
     """Return the unit in which steps up to `most` are drawn, and its name."""
     if most >= 500_000:

@@ -1,8 +1,9 @@
-"""Show the progress of a run, in lines on stderr."""
+"""Show the progress of a run, in lines on stderr; a terminal's is rewritten."""
 
 import contextlib
 import datetime
 import math
+import shutil
 import sys
 import threading
 import time
@@ -38,9 +39,14 @@ def announced(title: str, name: str, *, at_once: bool = False) -> Iterator[None]
         thread.join()
 
 
-def _line(title: str, text: str) -> None:
+def _line(title: str, text: str, *, kept: bool = True) -> None:
+    line = f"{title}: {text}"
+    if sys.stderr.isatty():
+        width = shutil.get_terminal_size().columns - 1
+        # A longer one would take two rows; what is at its end changes most.
+        line = f"\r{' ' * width}\r{line if kept else line[-width:]}"
     # One write, so that other threads' lines are not mixed with it.
-    sys.stderr.write(f"{title}: {text}\n")
+    sys.stderr.write(line + "\n" * kept)
     sys.stderr.flush()
 
 
@@ -62,7 +68,7 @@ class Progress:
         self._amount = f"{total_steps // num_members:,} steps{times}"
         self._training_since = self._last_line = time.monotonic()
         self._steps_before = 0
-        self._return = "(none ended)"
+        self._return, self._kept = "(none ended)", True
 
     def phase(self, name: str, steps: int = 0) -> None:
         """Show the name of a phase that begins after `steps` environment steps."""
@@ -91,16 +97,25 @@ class Progress:
         if each:
             self._return = f"{interquartile_mean(np.array(each)):.1f}"
         now = time.monotonic()
-        if now - self._last_line > _SECONDS_BETWEEN_LINES or steps >= self._total:
+        rewritten = sys.stderr.isatty() and steps < self._total
+        waited = rewritten or now - self._last_line > _SECONDS_BETWEEN_LINES
+        if waited or steps >= self._total:
             self._last_line = now
             seconds = max(now - self._training_since, 1e-9)
             speed = (steps - self._steps_before) / seconds
             left = datetime.timedelta(seconds=math.ceil((self._total - steps) / speed))
             self._tell(
                 f"{steps // self._num_members:,}/{self._amount}, return "
-                f"{self._return}, {speed:,.0f} steps/s, {left} left"
+                f"{self._return}, {speed:,.0f} steps/s, {left} left",
+                kept=not rewritten,
             )
 
-    def _tell(self, text: str) -> None:
+    def close(self) -> None:
+        """End a line that would have been rewritten."""
+        if not self._kept:
+            sys.stderr.write("\n")
+
+    def _tell(self, text: str, *, kept: bool = True) -> None:
         if self._shown:
-            _line(self._title, text)
+            _line(self._title, text, kept=kept)
+            self._kept = kept

@@ -1,5 +1,6 @@
 """Train programs in their folders, for the command line, `fit` and experiments."""
 
+import contextlib
 import pathlib
 from collections.abc import Sequence
 from typing import Any
@@ -111,7 +112,7 @@ def train_programs(
         if interruption.signal is not None:
             raise Interrupted(interruption.signal)
         members = make_members(env, each.algorithm, each.seeds, each.hyperparameters)
-        with each.opened():
+        with each.opened(), contextlib.closing(progress):
             with progress.aside("starting the trackers"):
                 own = _trackers(recording.log, each)
             outcome = driver.drive(

@@ -5,9 +5,11 @@ import shutil
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from gasil_jax.cli import plot
 from gasil_jax.errors import InputError
+from gasil_jax.statistics import interquartile_mean
 
 pytestmark = pytest.mark.xdist_group("commands")
 
@@ -79,7 +81,51 @@ def test_a_table_that_is_being_written_is_read_up_to_its_last_whole_row(
     np.testing.assert_allclose(plot.read(out).final, final)
 
 
-def test_other_metrics_are_drawn(trained, figures, tmp_path):
-    out = ["--metric", "entropy", "--out", str(tmp_path / "x.png")]
-    assert plot.main([str(trained.folder), *out]) == 0
-    assert figures[-1].axes[0].get_ylabel() == "entropy"
+def test_other_metrics_and_x_axes_are_drawn(trained, figures, tmp_path):
+    drawn = ["--metric", "entropy", "--x", "iteration", "--smooth", "4"]
+    out = ["--out", str(tmp_path / "x.png")]
+    assert plot.main([str(trained.folder), *drawn, *out]) == 0
+    axes, read = figures[-1].axes[0], plot.read(trained.folder, metric="entropy")
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("iteration", "entropy")
+    line = axes.get_lines()[0]
+    np.testing.assert_array_equal(line.get_xdata(), [1, 2, 3, 4])
+    last = interquartile_mean(read.returns.mean(axis=1))
+    np.testing.assert_allclose(line.get_ydata()[-1], last)
+    assert plot.read(trained.folder, x="episodes").env_steps[-1] > 0
+
+
+def test_files_of_other_libraries_are_curves(trained, figures, tmp_path, capsys):
+    """Stable-Baselines3's monitor, with a comment, and CleanRL's with empty cells."""
+    monitors = tmp_path / "monitors"
+    monitors.mkdir()
+    for seed in range(2):
+        rows = "".join(f"{seed + i},10,{i}.5\n" for i in range(20))
+        (monitors / f"{seed}.csv").write_text(f"#{{}}\nr,l,t\n{rows}")
+    read = plot.read_csv(monitors, None, ("sum:l", "r"))
+    assert read.returns.shape == (2, 20) and read.env_steps[-1] == 200
+    np.testing.assert_allclose(read.final, [18.5, 19.5])
+    clean = tmp_path / "clean.csv"
+    clean.write_text("global_step,charts/episodic_return\n100,\n200,3.0\n300,4.0\n")
+    columns = ["--columns", "global_step", "charts/episodic_return"]
+    out = ["--out", str(tmp_path / "x.png")]
+    assert plot.main([str(trained.folder), str(clean), *columns, *out]) == 0
+    # It stands beside the run.
+    assert len(figures[-1].axes) == 3
+    assert "clean" in texts(figures[-1].axes[0].get_legend())
+    for name, rows, message in (
+        ("none", None, "No such file"),
+        ("damaged", "1,x", "could not convert string to float: 'x'"),
+        ("empty", "", "global_step must have numbers"),
+        ("falls", "2,1\n1,2", "global_step must have numbers that do not fall"),
+    ):
+        path = tmp_path / f"{name}.csv"
+        if rows is not None:
+            path.write_text(f"global_step,charts/episodic_return\n{rows}\n")
+        told = refused(capsys, plot, path, *columns, "--out", tmp_path / "y.png")
+        assert f"{path} can't be drawn: " in told and message in told
+    (monitors / "1.csv").write_text("r,l\n1,900\n")
+    told = refused(capsys, plot, monitors, "--columns", "sum:l", "r")
+    assert f"{monitors} can't be drawn: no sum:l is in all its files" in told
+    assert "columns has 0 names: " in refused(capsys, plot, clean)
+    told = refused(capsys, plot, clean, "--columns", "global_step", "return")
+    assert "column 'return' is unknown: did you mean" in told

@@ -51,6 +51,7 @@ hopper --alpha big | alpha is 'big': it must be a number
 hopper --minibatch-size 60 | nearest that does is 64
 hopper --reward-delay 0 | reward_delay is 0
 hopper --out /proc/nowhere/run | can't be written
+hopper --lr 1 | option --lr is unknown: did you mean --learning-rate?
 hopper --total-step 5 | is unknown: did you mean --total-steps?
 hopper --xyz 5 | option --xyz is unknown: see --help
 hopper --normalize-rewards False | 'False' is not an option or its
@@ -127,6 +128,8 @@ evaluate RUN/nowhere | does not exist: it must be the folder of a run or a sweep
 swept --point 4 | has points 0 to 1
 swept --point 1 --checkpoint best | it must be 'last'
 draw --metric entropie | metric 'entropie' is unknown: did you mean 'entropy'
+draw --smooth 0 | smooth is 0: it must be 1 or more
+draw --x steps | x is 'steps': it must be one of env_steps
 draw --out x.txt | must end in .png, .pdf, .svg
 draw --out RUN/learning_curve.png | which exists: name a new file
 draw --out /proc/nowhere/x.png | out is /proc/nowhere/x.png

@@ -23,6 +23,11 @@ def test_parts_are_means_where_every_seed_has_ended_an_episode():
     assert ends.shape == (0,) and means.shape == (2, 0)
 
 
+def test_a_moving_mean_is_of_the_points_before():
+    smoothed = plotting.smoothed(np.array([[1.0, 3.0, 5.0, 7.0]]), 2)
+    np.testing.assert_allclose(smoothed, [[1.0, 2.0, 4.0, 6.0]])
+
+
 def made_up(env, label, num_seeds, scale):
     draw = np.random.default_rng(num_seeds).normal
     steps = np.linspace(2e4, 1e6, 50)

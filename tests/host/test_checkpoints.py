@@ -155,8 +155,8 @@ def test_a_checkpoint_that_cannot_be_deleted_is_left(tmp_path, monkeypatch):
     assert names(tmp_path) == ["00000002"]
 
 
-def test_a_disk_that_is_full_during_a_checkpoint_is_told_in_a_line(tmp_path):
-    """Beside it, Orbax's and TensorStore's threads have tracebacks of their own."""
+def test_a_disk_that_is_full_during_a_checkpoint_is_told_once(tmp_path, capfd, caplog):
+    """Orbax's and TensorStore's threads would print tracebacks of their own."""
     state = {str(i): np.random.default_rng(i).normal(size=10_000) for i in range(60)}
     _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     # No file may grow beyond this: writing fails as on a full disk.
@@ -168,6 +168,7 @@ def test_a_disk_that_is_full_during_a_checkpoint_is_told_in_a_line(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert str(told.value) == f"{tmp_path} can't be written: File too large"
     assert names(tmp_path) == []
+    assert capfd.readouterr().err == caplog.text == ""
 
 
 def test_a_flush_that_failed_is_told(tmp_path, monkeypatch):

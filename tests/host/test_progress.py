@@ -1,5 +1,7 @@
 """Progress messages."""
 
+import io
+import sys
 import threading
 import time
 
@@ -59,3 +61,25 @@ def test_the_speed_excludes_time_spent_aside(monkeypatch, capsys):
     assert lines[1] == (
         "hopper ppo: 2,000/2,000 steps, return 3.0, 100 steps/s, 0:00:00 left"
     )
+
+
+def test_a_terminal_has_one_line_that_is_rewritten_until_the_end(monkeypatch):
+    terminal = io.StringIO()
+    terminal.isatty = lambda: True
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("COLUMNS", "40")
+    shown = progress.Progress("hopper ppo", 2000)
+    shown.phase("training")
+    for steps in (500, 1000, 2000):
+        shown.update(steps, np.ones((1, 1)))
+    before = f"\r{' ' * 39}\r"
+    _, whole, first, second, last = terminal.getvalue().split(before)
+    assert whole == "hopper ppo: training\n" and last.endswith(" 0:00:00 left\n")
+    # Only the end of a longer line has room, and the next takes its row.
+    assert [len(x) for x in (first, second)] == [39, 39]
+    assert first.endswith(" left") and second.endswith(" left")
+    shown.close()
+    assert terminal.getvalue().endswith(last)
+    shown.update(500, np.ones((1, 1)))
+    shown.close()
+    assert terminal.getvalue().endswith(" left\n")
