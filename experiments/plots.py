@@ -260,10 +260,10 @@ def forest(results: Results, kind: str = "") -> Picture:
 
 
 def _draw_rows(
-    axes: Any, rows: Sequence[Comparison], null: float, places: Sequence[int]
+    axes: Any, rows: Sequence[Comparison], null: float, heights: Sequence[int]
 ) -> None:
     axes.axvline(null, color="0.3", linewidth=0.8)
-    for y, one in zip(places, rows, strict=True):
+    for y, one in zip(heights, rows, strict=True):
         color = _VERDICTS["not clear" if one.below else one.verdict]
         axes.plot([null + one.low, null + one.high], [y, y], color=color, linewidth=3)
         axes.plot(null + one.middle, y, "o", color=color, markersize=5)

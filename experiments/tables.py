@@ -21,7 +21,6 @@ from gasil_jax.algorithms import Algorithm
 from gasil_jax.errors import InputError, unknown
 from gasil_jax.statistics import interquartile_mean
 
-_ALL = "All runs are trained."
 #: Mean returns that others have published, after about 1M steps, with their sources.
 PUBLISHED = pathlib.Path(__file__).parent / "published.csv"
 
@@ -122,14 +121,18 @@ def numbers(results: Results, kind: str = "") -> str:
     if any(floors):
         rows.append(["doing nothing", *(number(x.mean) if x else "" for x in floors)])
     head = ["", *(x.removeprefix("sparse:") for x in panels)]
-    told = lacking(results, kind)
-    parts = [told if told != _ALL else "", markdown_table(head, rows)]
+    parts = [_untrained(results, kind), markdown_table(head, rows)]
     for sooner in (False, True) if results.sooner else (False,):
         parts.append(_compared(results.forest(kind, sooner), results, sooner))
     return folded("Numbers", *parts)
 
 
 def lacking(results: Results, kind: str = "") -> str:
+    """Return what is not trained yet of a kind, or that all is."""
+    return _untrained(results, kind) or "All runs are trained."
+
+
+def _untrained(results: Results, kind: str) -> str:
     """Return how many runs of a kind are not trained yet, and of which panels."""
     asked, total, left = results.figure.of_kind(kind), 0, dict[str, int]()
     for panel, name, curve in results.figure.curves():
@@ -139,7 +142,7 @@ def lacking(results: Results, kind: str = "") -> str:
             total += curve.seeds
             left |= {panel: left.get(panel, 0) + missing} if missing else {}
     if not left:
-        return _ALL
+        return ""
     runs = f"{sum(left.values())} of {total} runs"
     return f"Not trained yet: {runs}. They are of {', '.join(left)}."
 

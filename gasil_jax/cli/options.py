@@ -155,7 +155,7 @@ def read(
         if not first.config.is_file():
             raise InputError(f"{origin}: it must be the config.json of a run")
         stored = sweep.read(first.config)
-    known: dict[str, Any] = {"env": dataclasses.MISSING, "preset": first.preset}
+    defaults: dict[str, Any] = {"env": dataclasses.MISSING, "preset": first.preset}
     if stored is None:
         agents = (first.agent or Options.agent).split(",")
         for name in agents:
@@ -166,14 +166,14 @@ def read(
     else:
         _refuse_others(first, stored, origin)
         every, seeds = [*stored.algorithms], stored.seeds
-        known = {"env": stored.env, "preset": stored.preset, "seeds": len(seeds)}
-        known["first_seed"] = seeds[0]
-    known["agent"] = ",".join(x.agent.name for x in every)
-    known["preset"] = known["preset"] or presets.DEFAULT
-    known["rewards"] = tuple(x.name for x in every[0].own_models)
-    known |= _switches(every[0])
+        defaults = {"env": stored.env, "preset": stored.preset, "seeds": len(seeds)}
+        defaults["first_seed"] = seeds[0]
+    defaults["agent"] = ",".join(x.agent.name for x in every)
+    defaults["preset"] = defaults["preset"] or presets.DEFAULT
+    defaults["rewards"] = tuple(x.name for x in every[0].own_models)
+    defaults |= _switches(every[0])
     parser = Parser(program, "--env NAME [options]", kind, COMMON)
-    parser.add_fields(kind, "run", kind(**known))
+    parser.add_fields(kind, "run", kind(**defaults))
     parser.add_fields(Recording, "recording", stored and stored.recording)
     parser.add_fields(Settings, "environment", stored and stored.settings)
     _add_algorithms(parser, every)

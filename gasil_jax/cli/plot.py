@@ -80,12 +80,12 @@ def read(
     if not metrics:
         raise InputError(f"{folder} has no curves to draw yet")
     values = metrics[metric]
-    places = {
+    on_axis = {
         "env_steps": metrics["env_steps"][0],
         "iteration": np.arange(1, values.shape[1] + 1),
         "episodes": np.nancumsum(metrics["episodes"], axis=1).mean(axis=0),
     }
-    env_steps, means = plotting.binned_returns(places[x], values)
+    env_steps, means = plotting.binned_returns(on_axis[x], values)
     if not len(env_steps):
         raise InputError(f"{folder}: not every seed has ended an episode")
     # Evaluations know the steps and the return alone.
@@ -258,19 +258,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise refusal("smooth", options.smooth, "1 or more")
     output_file.check(options.out, (".png", ".pdf", ".svg"))
     drawn = {"metric": options.metric, "x": options.x}
-    runs, places = [], []
+    runs, sources = [], []
     for folder, label in zip(options.runs, labels, strict=True):
         foreign = options.columns and not folders.has_config(folder)
         if foreign or folder.suffix == ".csv":
             runs.append(read_csv(folder, label, options.columns))
-            places.append(folder)
+            sources.append(folder)
             continue
         best = {} if options.point is not None else results.best_points(folder)[1]
         several = {x: y for x, y in best.items() if y is not None and len(best) > 1}
         for agent, point in several.items() or [("", options.point)]:
             own = f"{label}, {agent}" if label and agent else label
             runs.append(read(folder, own, point, **drawn))
-            places.append(folder)
+            sources.append(folder)
     told = [run.label for run in runs]
     # A file does not say its environment: it stands beside the first run.
     env = next((run.env for run in runs if run.env), "")
@@ -280,7 +280,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             label=f"{run.label} ({folder})" if told.count(run.label) > 1 else run.label,
             returns=plotting.smoothed(run.returns, options.smooth),
         )
-        for folder, run in zip(places, runs, strict=True)
+        for folder, run in zip(sources, runs, strict=True)
     ]
     output_file.make_parent(options.out)
     with output_file.atomic(options.out) as partial:

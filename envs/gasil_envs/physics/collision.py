@@ -420,9 +420,9 @@ def _lying(
     def contact(own: int) -> _Point:
         height = jnp.where(near[own], heights[own], heights[1 - own])
         x, y, _ = jnp.where(near[own], ends[own], ends[1 - own])
-        place = jnp.stack([x, y, up * (size[1] + 0.5 * height)])
+        point = jnp.stack([x, y, up * (size[1] + 0.5 * height)])
         down = jnp.stack([0.0 * up, 0.0 * up, -up])
-        mine = zip((height, place, down), one, strict=True)
+        mine = zip((height, point, down), one, strict=True)
         a, b, c = (jnp.where(near[0] | near[1], x, y) for x, y in mine)
         return a, b, c
 
