@@ -32,8 +32,8 @@ from gasil_jax.context import Context, Metrics, Sizes
 # each with a prime that the hash multiplies by.
 _COUNTERS, _DIRECTIONS = 2**14, 4
 _PRIMES = (73856093, 19349663, 83492791, 49979687)
-#: Weight of an episode's mean novelty, from 0 to 1, in its rank. It decides only
-#: between episodes whose returns differ by less than this.
+#: Weight of an episode's novelty, from 0 to 1, in its rank. It decides only between
+#: episodes whose returns differ by less than this.
 TIE = 1e-3
 
 

@@ -64,11 +64,11 @@ def algorithm_of(
     point: Point, algorithms: Sequence[Algorithm]
 ) -> tuple[Algorithm, dict[str, Any]]:
     """Return a point's algorithm, by default the first, and the values it changes."""
-    values, known = dict(point), {x.agent.name: x for x in algorithms}
+    values, by_name = dict(point), {x.agent.name: x for x in algorithms}
     agent = values.pop("agent", algorithms[0].agent.name)
-    if agent not in known:
-        raise InputError(unknown("agent", agent, [*known]))
-    return known[agent], values
+    if agent not in by_name:
+        raise InputError(unknown("agent", agent, [*by_name]))
+    return by_name[agent], values
 
 
 def completed(every: Iterable[Point], *algorithms: Algorithm) -> tuple[Point, ...]:
@@ -178,8 +178,8 @@ def make_points(
     if random is None:
         every = itertools.product(*values.values())
         return [dict(zip(values, point, strict=True)) for point in every]
-    known = set.intersection(*({*_kinds(algorithm)} for algorithm in algorithms))
-    values = values or {name: x for name, x in PAPER_RANGES.items() if name in known}
+    shared = set.intersection(*({*_kinds(algorithm)} for algorithm in algorithms))
+    values = values or {name: x for name, x in PAPER_RANGES.items() if name in shared}
     sizes = [len(listed) for listed in values.values()]
     count = math.prod(sizes)
     if not 1 <= random <= min(count, 10_000):
